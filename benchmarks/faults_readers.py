@@ -30,7 +30,7 @@ from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.detections import read_detections
 from kinefit.readers.skeletons.characters import read_character
-from kinefit.readers.take.silhouettes import read_silhouettes
+from kinefit.sensors.kinds.silhouettes import read_silhouettes
 from kinefit.readers.video import Video
 path = Path(sys.argv[1])
 print(*answer(Seed((path,), lambda: {code}), path.parent))

@@ -259,7 +259,7 @@ def _static_points(folder: Path) -> Seed:
 
 def _lines(ending: str) -> Callable[[Path], Seed]:
     def make(folder: Path) -> Seed:
-        from kinefit.readers.take.lines import read_lines
+        from kinefit.sensors.kinds.lines import read_lines
 
         keys = ("frame", "line", "u1", "v1", "u2", "v2")
         rows = [(i, name, 1.5, 2, 30, 4) for i in range(3) for name in ("hips", "back")]
@@ -396,7 +396,7 @@ def _images(ending: str) -> Callable[[Path], Seed]:
 
 
 def _masks(folder: Path) -> Seed:
-    from kinefit.readers.take.silhouettes import read_silhouettes
+    from kinefit.sensors.kinds.silhouettes import read_silhouettes
 
     (folder / "masks").mkdir()
     for i in range(2):

@@ -87,7 +87,7 @@ def _pages(folder: Path) -> Seed:
 
 
 def _masks(folder: Path) -> Seed:
-    from kinefit.readers.take.silhouettes import read_silhouettes
+    from kinefit.sensors.kinds.silhouettes import read_silhouettes
 
     packings = (
         cv2.IMWRITE_TIFF_COMPRESSION_LZW, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE, cv2.IMWRITE_TIFF_COMPRESSION_NONE,

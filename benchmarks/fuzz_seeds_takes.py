@@ -142,7 +142,7 @@ def _surface_points(folder: Path) -> Seed:
 
     def read() -> object:
         seen = load_observations(read_take(folder / "take.toml"))
-        return [video.frame(i) for video in seen.surface_points for i in range(min(len(video), 3))]
+        return [video.frame(i) for video in seen.of_kind("surface_points") for i in range(min(len(video), 3))]
 
     return Seed((folder / "surface.csv",), read)
 
@@ -153,7 +153,7 @@ def _tracker_table(path: Path) -> None:
 
 
 def _trackers(folder: Path) -> Seed:
-    from kinefit.readers.tracked_points import read_body_trackers
+    from kinefit.sensors.kinds.trackers import read_body_trackers
 
     _tracker_table(folder / "trackers.csv")
 

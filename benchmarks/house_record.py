@@ -53,8 +53,9 @@ def _commands() -> Iterator[str]:
 
 def _take_keys() -> Iterator[str]:
     from kinefit.readers.take.entries import TABLES, keys_of
+    from kinefit.readers.take.kinds import BUILT_IN
 
-    for table in TABLES:
+    for table in (*TABLES, *BUILT_IN):
         yield from (f"take [{table}] {key}" for key in keys_of(table))
 
 

@@ -78,7 +78,7 @@ def first_motion(folder: Path) -> tuple[Rig, tuple[SilhouetteVideo, ...], list[B
         path.write_text(take_text(folder, "masks").replace(f"frames = [0, {FRAMES}]\n", f"frames = [0, {STEPS}]\n", 1))
         take = read_take(path)
         seen = load_observations(take)
-        masks, motion = seen.silhouettes, track_take(path)[0]
+        masks, motion = seen.of_kind("silhouette"), track_take(path)[0]
     assert seen.rig is not None
     return seen.rig, masks, [BodyState(T, q) for T, q in zip(motion.Ts_world_root, motion.angles)]
 

@@ -67,8 +67,8 @@ def held_out(folder: Path, model: AnnyModel, camera: str) -> tuple[NDArray, NDAr
         path.write_text(whole)
         seen = load_observations(read_take(path))
     assert seen.rig is not None
-    own = tuple(v for v in seen.silhouettes if v.sensor == camera)
-    masks = tuple(v for v in seen.silhouettes if v.sensor != camera)
+    own = tuple(v for v in seen.of_kind("silhouette") if v.sensor == camera)
+    masks = tuple(v for v in seen.of_kind("silhouette") if v.sensor != camera)
     rig = Rig(tuple(c for c in seen.rig if c.name != camera))
     motion = tracked(text, "humanoid")
     states, out = [BodyState(T, q) for T, q in zip(motion.Ts_world_root, motion.angles)], []

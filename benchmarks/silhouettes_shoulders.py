@@ -116,7 +116,7 @@ def run() -> None:
             continue
         text = take_text(folder, "masks", [c for c in CAMERAS if c != camera])
         for name, body in (("morphing", "humanoid_morphing"), ("stiff", stiff())):
-            found[name].append(shoulders(tracked(text, body), seen.rig, seen.silhouettes[k]))
+            found[name].append(shoulders(tracked(text, body), seen.rig, seen.of_kind("silhouette")[k]))
         a, b = (found[name][-1] for name in found)
         print(f"#   {camera} held out, around the shoulders, morphing and stiff: overlap {a.overlap.mean():.4f} and "
               f"{b.overlap.mean():.4f}, outlines {a.distance.mean():.1f} and {b.distance.mean():.1f} mm; arms raised "

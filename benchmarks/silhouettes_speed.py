@@ -121,7 +121,7 @@ def _real(rendered_ms: float) -> None:
         path.write_text(re.sub(r"frames = \[0, \d+\]", "frames = [0, 2]", text, count=1))
         start = track_take(path, smooth=False)[0]
     assert seen.rig is not None
-    masks = [[video.frame(i) for video in seen.silhouettes] for i in range(FRAMES)]
+    masks = [[video.frame(i) for video in seen.of_kind("silhouette")] for i in range(FRAMES)]
     rounds: list[list[float]] = []
     iterations = 0
     for _ in range(ROUNDS):

@@ -87,7 +87,7 @@ def run() -> None:
         path.write_text(take_text(folder, "masks"))
         take = read_take(path)
         seen = load_observations(take)
-        masks = seen.silhouettes
+        masks = seen.of_kind("silhouette")
     assert seen.rig is not None
     motion = tracked(take_text(folder, "masks"))
     given = overlaps(motion, seen.rig, masks)

@@ -18,8 +18,8 @@ from kinefit.geometry.camera import Camera
 from kinefit.live.cameras import SessionClock
 from kinefit.live.folders import ImageFolderStream
 from kinefit.readers.depth.recordings import read_depth
-from kinefit.readers.take.silhouettes import read_silhouettes
 from kinefit.readers.video import Video
+from kinefit.sensors.kinds.silhouettes import read_silhouettes
 
 PICTURE = np.random.default_rng(0).integers(0, 255, (19, 37, 3), np.uint8)
 KINDS = [

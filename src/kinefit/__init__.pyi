@@ -18,6 +18,8 @@ from kinefit.losses import geman_mcclure as geman_mcclure, huber as huber, tukey
 from kinefit.rows import Rows as Rows
 from kinefit.sensors.base import Hints as Hints, Measurement as Measurement, RowsOf as RowsOf, Sensor as Sensor
 from kinefit.sensors.base import Unknown as Unknown
+from kinefit.observations import SensorRecording as SensorRecording
+from kinefit.readers.take.kinds import Proposal as Proposal, SensorKind as SensorKind, TakeEntry as TakeEntry
 from kinefit.sensors.scene import Scene as Scene
 
 # From a recording to a motion

@@ -131,6 +131,10 @@ class TakeError(KinefitError):
     """A take file names something that is not there or contradicts itself."""
 
 
+class PluginError(KinefitError):
+    """A plug-in of another distribution cannot be imported, raises an error, or returns what it must not."""
+
+
 class BodyError(KinefitError):
     """A body file, or a name asked of a body, is wrong."""
 

@@ -15,6 +15,7 @@ from kinefit.exporters import tables
 from kinefit.readers.keypoint_sets import KEYPOINT_SETS
 from kinefit.readers.take import entries
 from kinefit.readers.take import file as takes
+from kinefit.sensors.kinds.silhouettes import SilhouetteEntry
 from kinefit.simulation import cut, squat_and_wave
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -45,7 +46,7 @@ def rows(text):
         (TAKE, "## `[calibration]`", entries.CalibrationEntry),
         (TAKE, "## `[[camera]]`", entries.CameraEntry), (TAKE, "## `[[keypoints]]`", entries.KeypointsEntry),
         (TAKE, "## `[[markers]]`", entries.MarkersEntry), (TAKE, "## `[[depth]]`", entries.DepthEntry),
-        (TAKE, "## `[[stereo]]`", entries.StereoEntry), (TAKE, "## `[[silhouette]]`", entries.SilhouetteEntry),
+        (TAKE, "## `[[stereo]]`", entries.StereoEntry), (TAKE, "## `[[silhouette]]`", SilhouetteEntry),
         (BODIES, "## `[body]`", records.HeadRecord),
         (BODIES, "## `[[segment]]`", records.SegmentRecord), (BODIES, "### `joint`", records.JointRecord),
     ],

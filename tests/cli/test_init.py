@@ -303,4 +303,5 @@ def test_a_surface_that_was_followed_is_entered(folder):
         "time_s,point,x,y,z,std_x,std_y,std_z\n0.0,1,0,0,0,0.001,0.001,0.001\n"
     )
     assert "surface/trajectories.csv" in run("init", folder).stdout
-    assert [entry.file.name for entry in read_take(folder / "take.toml").surface_points] == ["trajectories.csv"]
+    entries = read_take(folder / "take.toml").sensors["surface_points"]
+    assert [entry.file.name for entry in entries] == ["trajectories.csv"]

@@ -229,7 +229,8 @@ def test_an_old_key_is_read_with_a_warning(table, take):
     path.write_text(text[:first] + text[first:].replace("sigma = 2.0\n", "", 1))
     with pytest.warns(FutureWarning, match="'accuracy' is now called 'sigma'"):
         read = read_take(path)
-    entry = {"keypoints": read.keypoints, "markers": read.markers, "depth": read.depth, "silhouettes": read.silhouettes}
+    masks = read.sensors.get("silhouette")
+    entry = {"keypoints": read.keypoints, "markers": read.markers, "depth": read.depth, "silhouettes": masks}
     assert entry[table][0].sigma == 0.5
 
 

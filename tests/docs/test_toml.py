@@ -13,6 +13,7 @@ from kinefit.cli import main
 from kinefit.readers.annotations import read_static_points
 from kinefit.readers.take.entries import TABLES
 from kinefit.readers.take.file import read_take
+from kinefit.readers.take.kinds import BUILT_IN
 
 CAMERA = '[calibration]\nfile = "calibration.toml"\n[[camera]]\nname = "cam01"\nvideo = "cam01.mp4"\n'
 SENSOR = '[[keypoints]]\ncamera = "cam01"\nfile = "cam01.npy"\nformat = "mediapipe"\n'
@@ -27,12 +28,15 @@ BOX = "".join(
 def whole(text):
     """What a block is, as the whole file that it belongs into: (kind, text)."""
     keys = tomllib.loads(text).keys()
-    if keys <= TABLES.keys():
+    tables = {*TABLES, *BUILT_IN}
+    if keys <= tables:
         if not keys & {"camera", "depth"}:
             text += CAMERA
-        if not keys & (TABLES.keys() - {"take", "session", "start", "calibration", "camera"}) and "stream" not in text:
+        if not keys & (tables - {"take", "session", "start", "calibration", "camera"}) and "stream" not in text:
             text += SENSOR
         return "take", text
+    if "project" in keys:
+        return "package", text
     if keys & {"body", "segment"}:
         return "body", text
     if keys == {"surface"}:
@@ -62,6 +66,8 @@ def read(kind, text, folder):
     content = tomllib.loads(text)
     path = folder / f"{content['body']['name'] if kind == 'body' else kind}.toml"
     path.write_text(text, encoding="utf-8")
+    if kind == "package":  # which tests/test_plugins.py installs
+        return content["project"]
     if kind == "take":
         take = read_take(path)
         return take if "body" not in content.get("take", {}) else load_body(take.body)

@@ -32,8 +32,8 @@ from kinefit.readers.guess.names import camera_number, natural
 from kinefit.readers.keypoints import read_caliscope_csv, read_keypoints
 from kinefit.readers.skeletons.acclaim import read_asf
 from kinefit.readers.take.file import read_take
-from kinefit.readers.tracked_points import read_surface_points
 from kinefit.readers.video import Video
+from kinefit.sensors.kinds.surface_points import read_surface_points
 
 COPIES = 25  # of each reader here; `python -m benchmarks.product fuzz` reads thousands
 linux = pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="memory is counted as Linux does")

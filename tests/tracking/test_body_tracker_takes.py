@@ -1,5 +1,7 @@
 """`[[tracker]]` of a take: trackers on the body from a table, alone and beside depth, and what is refused."""
 
+import re
+
 import numpy as np
 import pytest
 from tests.sensors.points.test_body_trackers import MOUNTS, POINTS, SIGMA, frame
@@ -10,7 +12,8 @@ from kinefit.errors import FileError, KinefitError, ObservationError
 from kinefit.geometry import se3
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
-from kinefit.readers.tracked_points import read_body_trackers
+from kinefit.sensors.kinds.trackers import read_body_trackers
+from kinefit.takes.check import check_take
 from kinefit.takes.track import track_take
 
 HEADER = "time_s,tracker,x,y,z,qw,qx,qy,qz\n"
@@ -113,10 +116,19 @@ def test_takes_that_are_refused(taken, old, new, said):
     assert raised.value.remedy or "there are" in raised.value.problem
 
 
+def test_the_check_makes_the_sensor(taken):
+    found = check_take(taken).findings
+    assert [finding.severity for finding in found] == ["note"] and "checked by itself" in found[0].text
+    taken.write_text(re.sub(r'skull = "\w+"', 'skull = "no_such_point"', taken.read_text()))
+    faults = [finding for finding in check_take(taken).findings if finding.severity == "fault"]
+    said = "[[tracker]] 1: tracker 'skull': no landmark or segment 'no_such_point'"
+    assert len(faults) == 1 and said in faults[0].text
+
+
 def test_a_take_of_two_tables(taken):
     text = taken.read_text()
     text += '[[tracker]]\nfile = "trackers.csv"\npoints = { skull = "nose_tip" }\nsigma = 0.5\nturn = [0, 0, 30]\n'
     taken.write_text(text)
     found, seen = track_take(read_take(taken))
-    assert [video.sensor for video in seen.trackers] == ["trackers 1", "trackers 2"]
+    assert [video.sensor for video in seen.of_kind("tracker")] == ["trackers 1", "trackers 2"]
     assert set(found.residuals) == {"trackers 1", "trackers 2"} and len(found.body.landmarks) == len(BODY.landmarks)

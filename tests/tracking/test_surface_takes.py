@@ -7,7 +7,7 @@ from benchmarks.surface_body import errors, moving_arm
 from kinefit.bodies.body_surfaces import sample
 from kinefit.errors import FileError, KinefitError, ObservationError
 from kinefit.readers.take.file import read_take
-from kinefit.readers.tracked_points import read_surface_points
+from kinefit.sensors.kinds.surface_points import read_surface_points
 from kinefit.takes.track import track_take
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
 
@@ -49,7 +49,7 @@ def test_points_of_a_table_move_the_body(taken, tmp_path):
     names = list(truth.body.tree.coordinates)
     off = np.degrees(np.abs(found.angles - truth.angles)).max(axis=0)
     assert off[names.index("elbow_flex_r")] < 1.0 and off[names.index("pro_sup_r")] < 2.0
-    assert list(found.residuals) == ["surface_points"] and len(seen.surface_points[0]) == 12
+    assert list(found.residuals) == ["surface_points"] and len(seen.of_kind("surface_points")[0]) == 12
     with Checkpoint(tmp_path / "unfinished", key_of(take)) as unfinished:  # what the sensor learnt is kept
         again, _ = track_take(take, checkpoint=unfinished)
     assert np.array_equal(again.angles, found.angles)
@@ -78,7 +78,7 @@ def test_tables_that_are_none(tmp_path, text, error, said):
         ("sigma = 0.003", "slide = 0.003", "no key 'slide'"),
         ("sigma = 0.003", "time_offset = 50.0", "points"),
         ("points.csv", "nothing.csv", "no such file"),
-        ("[start]\nat = [0, 0, 0]\nforward = [1, 0, 0]\nangles", "[session]\n#", "alone do not determine"),
+        ("[start]\nat = [0, 0, 0]\nforward = [1, 0, 0]\nangles", "[session]\n#", "alone does not determine"),
     ],
 )
 def test_takes_that_are_refused(taken, old, new, said):

@@ -150,6 +150,7 @@ def track_person(
     from kinefit.batch.viewed import OUTDATED, inputs_entry, is_outdated
     from kinefit.findings import NOTES
     from kinefit.multiview import followed
+    from kinefit.readers.take.kinds import kinds_of
     from kinefit.takes.track import settings_of, track_take
     from kinefit.tracking import cameras
     from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
@@ -160,7 +161,8 @@ def track_person(
     how: dict[str, Any] = {"smooth": choices.smooth, "contacts": choices.contacts, "lag": choices.lag}
     total, inputs = 0, inputs_entry(take)
     with ExitStack() as work:
-        unfinished = work.enter_context(Checkpoint(out / "unfinished", key_of(take, **how), restart=choices.restart))
+        key, kinds = key_of(take, **how), kinds_of(take)
+        unfinished = work.enter_context(Checkpoint(out / "unfinished", key, restart=choices.restart, kinds=kinds))
         for sentence in unfinished.said():
             tell(sentence)
         step("reading", 0, 0)

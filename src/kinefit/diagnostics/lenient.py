@@ -26,7 +26,7 @@ _MAX_ATTEMPTS = 12  # to load; each works around one error
 def calibrated(take: Take) -> tuple[Take, Rig | None, list[Finding]]:
     """The take without cameras that its calibration lacks, and the calibration's rig; None if that cannot be read."""
     stated = take.calibration
-    if stated is None and not take.depth and (take.cameras or not take.markers):
+    if stated is None and not take.depth and (take.cameras or not (take.markers or take.sensors)):
         remedy = "Add [[camera]] and [calibration]."
         return take, None, [Finding("fault", "load", "The take names no cameras.", remedy=remedy)]
     try:
@@ -105,6 +105,8 @@ def too_few(take: Take, seen: Observations, cameras: int) -> list[Finding]:
         return []
     if take.markers and not take.cameras:
         return [Finding("note", "load", "Markers alone: their labels are checked, and nothing else.")]
+    if take.sensors and not take.cameras:
+        return [Finding("note", "load", "No cameras: each sensor is checked by itself, and nothing else.")]
     text = f"Keypoints of {cameras} camera(s): a check needs those of two or more."
     alone = len(take.cameras) == 1
     remedy = f"{ONE_CAMERA[0].upper()}{ONE_CAMERA[1:]}." if alone else f"Run: {command('detect', take.path)}"

@@ -1,19 +1,19 @@
-"""Recordings of one sensor with a time for each frame: images, clouds, keypoints, lines, trackers, surface points."""
+"""Recordings of one sensor with a time for each frame: images, clouds, keypoints, lines."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
-from kinefit.observations.arrays import freeze, frozen, sealed
+from kinefit.observations.arrays import freeze, sealed
 from kinefit.observations.frames import (
-    BodyTrackerFrame,
     ClickFrame,
     ColourFrame,
     DepthFrame,
@@ -22,7 +22,6 @@ from kinefit.observations.frames import (
     MarkerFrame,
     PointCloud,
     SilhouetteFrame,
-    SurfacePointFrame,
 )
 from kinefit.observations.recordings import Markers
 
@@ -57,15 +56,37 @@ def checked_times(times: NDArray, sensor: str, source: str = "") -> NDArray:
 
 
 @dataclass(frozen=True, eq=False)
-class _Recording:
-    """Base of recordings of one sensor with a time for each frame."""
+class SensorRecording(ABC):
+    """Base of recordings of one sensor with a time for each frame.
+
+    Parameters
+    ----------
+    sensor : name
+    rate : float [Hz]; None: that of the median step of the times
+    times : (F,) [s] in the take; strictly increasing
+
+    Raises
+    ------
+    ObservationError
+        Times that do not increase; a single time without a rate.
+    """
 
     sensor: str
     rate: float
     times: NDArray
 
     def __post_init__(self) -> None:
-        freeze(self, times=checked_times(self.times, self.sensor, getattr(self, "source", "")))
+        source = getattr(self, "source", "")
+        freeze(self, times=checked_times(self.times, self.sensor, source))
+        if self.rate is None:
+            if len(self.times) < 2:
+                remedy = "Give two frames or more, or the rate."
+                raise ObservationError(f"{self.sensor} has one frame and no rate", file=source or None, remedy=remedy)
+            freeze(self, rate=1.0 / float(np.median(np.diff(self.times))))
+
+    @abstractmethod
+    def frame(self, i: int) -> Any:
+        """Frame number `i`: a measurement, or what its sensor prepares."""
 
     def __len__(self) -> int:
         return len(self.times)
@@ -99,7 +120,7 @@ class _Recording:
 
 
 @dataclass(frozen=True, eq=False)
-class ColourVideo(_Recording):
+class ColourVideo(SensorRecording):
     """Colour images of one camera.
 
     Parameters
@@ -149,7 +170,7 @@ def _image(video: ColourVideo | DepthVideo, i: int) -> tuple[float, NDArray]:
 
 
 @dataclass(frozen=True, eq=False)
-class DepthVideo(_Recording):
+class DepthVideo(SensorRecording):
     """Depth images of one sensor.
 
     Parameters
@@ -220,7 +241,7 @@ class DepthVideo(_Recording):
 
 
 @dataclass(frozen=True, eq=False)
-class CloudVideo(_Recording):
+class CloudVideo(SensorRecording):
     """Unordered point clouds of one sensor.
 
     Parameters
@@ -275,7 +296,7 @@ class CloudVideo(_Recording):
 
 
 @dataclass(frozen=True, eq=False)
-class KeypointVideo(_Recording):
+class KeypointVideo(SensorRecording):
     """Keypoints of one person in one camera, detected on demand.
 
     Parameters
@@ -317,7 +338,7 @@ class KeypointVideo(_Recording):
 
 
 @dataclass(frozen=True, eq=False)
-class LineVideo(_Recording):
+class LineVideo(SensorRecording):
     """Image lines and edges of known objects in one camera.
 
     Parameters
@@ -396,86 +417,3 @@ class NamedMarkers:
             return None
         own = k / self.markers.rate + first
         return MarkerFrame(self.sensor, own, self.markers.names, self.markers.positions[k], self.marker_set)
-
-
-@dataclass(frozen=True, eq=False)
-class BodyTrackerVideo(_Recording):
-    """Trackers on the body over time.
-
-    Parameters
-    ----------
-    sensor : str
-    rate : float [Hz]
-    times : (F,) [s] in the take; strictly increasing
-    names : (K,) of the trackers
-    x_world : (F, K, 3) [m]; NaN if missing
-    Rs_world_tracker : (F, K, 3, 3); NaN if missing
-    source : file, for messages
-
-    Raises
-    ------
-    ObservationError
-        Times that do not increase; arrays of other shapes.
-    """
-
-    names: tuple[str, ...]
-    x_world: NDArray
-    Rs_world_tracker: NDArray
-    source: str = ""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        what, shape, file = f"trackers of {self.sensor}", (len(self), len(self.names), 3), self.source or None
-        x = frozen(self.x_world, float, what, shape, file)
-        R = frozen(self.Rs_world_tracker, float, f"rotations of {what}", (*shape, 3), file)
-        freeze(self, x_world=x, Rs_world_tracker=R)
-
-    def frame(self, i: int) -> BodyTrackerFrame:
-        """Frame number `i`; a negative number counts from the end."""
-        i, time = self._at(i)
-        return BodyTrackerFrame(self.sensor, time, self.names, self.x_world[i], self.Rs_world_tracker[i])
-
-
-@dataclass(frozen=True, eq=False)
-class SurfacePointVideo(_Recording):
-    """Tracked points of a surface over time.
-
-    Parameters
-    ----------
-    sensor : str
-    rate : float [Hz]
-    times : (F,) [s] in the take; strictly increasing.
-    first : (F + 1,) int
-        Start of each frame in the columns below, and their length.
-    ids : (N,) int, the same for the same point at all times
-    x_world : (N, 3) [m]
-    std : (N, 3) [m] standard deviations along the world's axes
-    source : str
-        File, for messages.
-
-    Raises
-    ------
-    ObservationError
-        Times that do not increase; columns of different lengths.
-    """
-
-    first: NDArray
-    ids: NDArray
-    x_world: NDArray
-    std: NDArray
-    source: str = ""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        lengths = {len(self.ids), len(self.x_world), len(self.std), int(self.first[-1]) if len(self.first) else -1}
-        if len(lengths) > 1 or len(self.first) != len(self.times) + 1:
-            problem = f"columns of {sorted(lengths)} points, {len(self.first)} starts of {len(self.times)} frames"
-            remedy = "Give every point its position and standard deviation."
-            raise ObservationError(problem, file=self.source or None, remedy=remedy)
-
-    def frame(self, i: int) -> SurfacePointFrame:
-        """Frame number `i`; a negative number counts from the end."""
-        i, time = self._at(i)
-        part = slice(int(self.first[i]), int(self.first[i + 1]))
-        covariance = self.std[part, :, None] ** 2 * np.eye(3)
-        return SurfacePointFrame(self.sensor, time, self.ids[part], self.x_world[part], covariance)

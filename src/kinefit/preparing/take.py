@@ -17,6 +17,7 @@ from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoint_sets import FACE_SET
 from kinefit.readers.take.entries import KeypointsEntry
 from kinefit.readers.take.file import Take
+from kinefit.readers.take.kinds import kinds_of
 
 
 def warn(text: str) -> None:
@@ -79,7 +80,7 @@ def with_detections(take: Take, progress: Step | None = None, tell: Tell = warn)
     """The take with the built-in detector's keypoints where it asks for them, or has nothing but videos."""
     if not uses_detector(take):
         return take
-    outlines = any(entry.format == "detect" and entry.file is None for entry in take.silhouettes)
+    outlines = any(entry.format == "detect" and entry.file is None for entry in take.sensors.get("silhouette", ()))
     files = ensure_detections(take, masks=True if outlines else None, progress=progress, tell=tell)
     if take.keypoints:
         return replace(take, keypoints=tuple(_with_file(entry, take) for entry in take.keypoints))
@@ -96,9 +97,8 @@ def uses_detector(take: Take) -> bool:
     """Whether a take asks for the built-in detector's keypoints, or has nothing but videos and so gets them."""
     if any(entry.format == "detect" and entry.file is None for entry in take.keypoints):
         return True
-    bodies = (take.depth, take.stereo, take.silhouettes, take.regions, take.trackers)
-    points = (take.keypoints, take.skin, take.lines, take.surface_points)
-    return any(camera.video for camera in take.cameras) and not (any(bodies) or any(points))
+    others = (take.depth, take.stereo, take.keypoints, take.skin, *(k.replaces_keypoints for k in kinds_of(take)))
+    return any(camera.video for camera in take.cameras) and not any(others)
 
 
 def _with_file(entry: KeypointsEntry, take: Take) -> KeypointsEntry:

@@ -8,7 +8,7 @@ from array import array
 from collections.abc import Iterable, Sequence
 from typing import Any, Generic, TypeVar, overload
 
-from kinefit._records import RecordFile
+from kinefit._records import Codec, RecordFile
 from kinefit.errors import ExportError
 from kinefit.smoothing.record_classes import CODEC
 
@@ -37,14 +37,17 @@ class Store:
     ----------
     in_memory : bytes up to which no file is made; default `IN_MEMORY`
     records : file that stays; default: a temporary one
+    codec : that writes and reads the records
     """
 
-    def __init__(self, in_memory: int | None = None, *, records: RecordFile | None = None) -> None:
+    def __init__(
+        self, in_memory: int | None = None, *, records: RecordFile | None = None, codec: Codec = CODEC
+    ) -> None:
         if records is None:
             file = tempfile.SpooledTemporaryFile(max(IN_MEMORY if in_memory is None else in_memory, 1))
             weakref.finalize(self, file.close)
             records = RecordFile(file)
-        self._records, self._shared, self._numbers = records, list[Any](), dict[int, int]()
+        self._records, self._codec, self._shared, self._numbers = records, codec, list[Any](), dict[int, int]()
 
     def write(self, thing: Any, tag: int = 0, number: int = 0) -> int:
         """Write an object; returns the byte at which it starts. Tag and number: see `RecordFile.append`.
@@ -55,7 +58,7 @@ class Store:
             The disk is full.
         """
         try:
-            return self._records.append(CODEC.encode(thing, self._refer), tag, number)
+            return self._records.append(self._codec.encode(thing, self._refer), tag, number)
         except OSError as error:
             raise self._full(error) from error
 
@@ -67,7 +70,7 @@ class Store:
         FileError
             The record is damaged.
         """
-        return CODEC.decode(self._records.read(at), self._resolve, name=self._records.name)
+        return self._codec.decode(self._records.read(at), self._resolve, name=self._records.name)
 
     def _full(self, error: OSError) -> ExportError:
         remedy = "Set TMPDIR to a folder with more room: up to 1 MB for each frame with depth or silhouettes."

@@ -21,7 +21,7 @@ from kinefit.readers.take.file import Take, read_take
 from kinefit.subject.subject import Subject
 from kinefit.takes.missing import prepared
 from kinefit.tracking.sizing import SizedPerson, sized_by_depth
-from kinefit.tracking.take_recording import label_findings_of, recording_of
+from kinefit.tracking.take_recording import label_findings_of, recording_of, sensors_of
 
 
 @checked
@@ -87,6 +87,20 @@ def _sensors(c: Checked) -> list[Finding]:
     return sensor_findings(c.sensors, c.take)
 
 
+def _kinds(c: Checked) -> list[Finding]:
+    """Sensors of kinds that stand apart: whether they can be made for the body, and what their own check finds."""
+    out, body = list[Finding](), load_body(c.take.body)
+    try:
+        sensors_of(c.take, c.observations, body)
+        for of in c.observations.sensors:
+            if of.kind.check is not None:
+                valid = lambda found: all(isinstance(one, Finding) for one in found)
+                out += of.kind.call("check", of.entry, of.recording, body, valid=valid, what="findings")
+    except KinefitError as error:
+        out.append(finding_of(error))
+    return out
+
+
 ALL_CHECKS = (
     *CHECKS,
     Check(
@@ -96,6 +110,10 @@ ALL_CHECKS = (
     Check(
         "depth cameras alone", _depth_alone, ("take", "observations"), 20.0,
         "A person who stands on the hands looks the same.",
+    ),
+    Check(
+        "kinds of sensors", _kinds, ("take", "observations"), 1.0,
+        "A wrong file, a clock that is off and another unit of the sensor look the same.",
     ),
     Check(
         "other sensors", _sensors, ("take", "observations", "keypoints"), 60.0,

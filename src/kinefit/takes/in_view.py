@@ -19,6 +19,7 @@ from kinefit.multiview.followed import PersonKeypoints, choose, follow
 from kinefit.multiview.people import PersonTrack
 from kinefit.observations import DepthFrame
 from kinefit.readers.take.file import Take
+from kinefit.readers.take.kinds import kinds_of
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.videos import TakePictures
 from kinefit.sensors.settings import TrackSettings
@@ -117,7 +118,7 @@ def people_in_view(take: Take) -> InView | None:
     None where markers, lines or other points take part, which are not parted by people, or where the take tells itself
     where a body is.
     """
-    points = take.markers or take.lines or take.skin or take.surface_points or take.trackers
+    points = take.markers or take.skin or not all(kind.shows_everybody for kind in kinds_of(take))
     if points or not (take.keypoints or ((take.depth or take.stereo) and not (take.start or take.pose))):
         return None
     seen = load_uncovered(take)

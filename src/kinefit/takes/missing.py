@@ -104,7 +104,7 @@ def find_cameras(
         return take
     take = with_detections(take, progress, tell)
     seen = {entry.camera for entry in take.keypoints}
-    if not (take.silhouettes or take.regions or take.skin or take.lines):
+    if not (take.skin or take.sensors):
         take = replace(take, cameras=tuple(camera for camera in take.cameras if camera.name in seen))
     if len(take.cameras) < 2:  # in the others no person is seen, as was said
         return take

@@ -18,6 +18,7 @@ from kinefit.readers.calibration.read import found_notes
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.checks import check_enough
 from kinefit.readers.take.file import Take, read_take
+from kinefit.readers.take.kinds import kinds_of, naming_plugins
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.online.lag_frame import KnownNoise
@@ -29,7 +30,13 @@ from kinefit.tracking.cameras import as_found
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint, TrackingInterrupted
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.sizing import channels_of
-from kinefit.tracking.take_recording import from_afar, label_findings_of, on_floor, recording_of, rig_on_floor
+from kinefit.tracking.take_recording import (
+    from_afar,
+    label_findings_of,
+    on_floor,
+    recording_of,
+    rig_on_floor,
+)
 from kinefit.tracking.video import Progress, track
 
 _DEFAULT_BODY = "humanoid"  # body of a take that names none
@@ -61,13 +68,12 @@ def track_take(
     view = view or people_in_view(take)
     seen = with_names(take, view.seen if view else load_uncovered(take), progress=progress)
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
-    sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin, take.trackers)
-    alone = take.start or take.pose or any(sensors)
-    if (take.silhouettes or take.regions or take.surface_points) and not alone:
-        kinds = {"surface_points": "surface points", "silhouette": "silhouettes", "region": "colours"}
-        table = next(kind for kind in kinds if any(kind == table for table, *_ in take.entries))
+    sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.skin)
+    alone = take.start or take.pose or any(sensors) or any(kind.finds_pose for kind in kinds_of(take))
+    if take.sensors and not alone:
+        table = next(iter(take.sensors))
         raise TakeError(
-            f"{kinds[table]} alone do not determine the first pose", file=take.path, place=f"[[{table}]]",
+            "it alone does not determine the first pose", file=take.path, place=f"[[{table}]]",
             remedy='Add [start], or [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
         )  # fmt: skip
     if not alone:
@@ -78,25 +84,27 @@ def track_take(
             f"body is {take.body}, but the motion of start has the body {body.name}",
             file=take.path, place="[take] start", remedy="Leave out body, or start from a motion of this body.",
         )  # fmt: skip
-    recording, body = recording_of(take, seen, body, view.people if view else None)
-    settings = settings_of(take, settings)
-    if view is not None:
-        recording = view.recording(recording, body, take.person, settings)
-    if take.pose is not None:
-        recording = from_afar(recording, body, settings, low_pass=take.pose.low_pass)
-    labels = label_findings_of(take, seen, body, refuse=True)
-    followed = recording.followed.keypoints if recording.followed else ()
-    findings = (*labels, *input_findings(take, seen, followed, body))
-    try:
-        motion = track(
-            recording, body, trial=trial_of(take), height=take.height, smooth=smooth, contacts=contacts,
-            size=take.start is None and take.size is not False, lag=lag, noise=noise, settings=settings,
-            progress=progress, checkpoint=checkpoint,
-        )  # fmt: skip
-    except TrackingInterrupted as stopped:
-        raise TrackingInterrupted(with_findings(stopped.motion, findings, seen, take.height), stopped.total) from None
-    except KinefitError as error:
-        raise with_cause(error, findings) from error
+    with naming_plugins(((one.recording.sensor, one.kind) for one in seen.sensors), take.path):
+        recording, body = recording_of(take, seen, body, view.people if view else None)
+        settings = settings_of(take, settings)
+        if view is not None:
+            recording = view.recording(recording, body, take.person, settings)
+        if take.pose is not None:
+            recording = from_afar(recording, body, settings, low_pass=take.pose.low_pass)
+        labels = label_findings_of(take, seen, body, refuse=True)
+        followed = recording.followed.keypoints if recording.followed else ()
+        findings = (*labels, *input_findings(take, seen, followed, body))
+        try:
+            motion = track(
+                recording, body, trial=trial_of(take), height=take.height, smooth=smooth, contacts=contacts,
+                size=take.start is None and take.size is not False, lag=lag, noise=noise, settings=settings,
+                progress=progress, checkpoint=checkpoint,
+            )  # fmt: skip
+        except TrackingInterrupted as stopped:
+            motion = with_findings(stopped.motion, findings, seen, take.height)
+            raise TrackingInterrupted(motion, stopped.total) from None
+        except KinefitError as error:
+            raise with_cause(error, findings) from error
     motion = with_findings(motion, findings, seen, take.height)
     motion = on_floor(motion, recording, view.floors if view else [])
     if seen.rig is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -37,9 +38,7 @@ from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.videos import load_stereo, stereo_sigma
 from kinefit.sensors.base import Sensor
-from kinefit.sensors.points.body_trackers import BodyTrackerSensor
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surfaces.surface_points import SurfacePointSensor
 from kinefit.smoothing.foot_contacts import FloorPlane, find_contacts, soles
 from kinefit.tracking.recording import Recording, spread
 
@@ -143,7 +142,7 @@ def recording_of(
         depth=_first_depth(depth, seen), on_body=tuple(v.sensor for v in depth if v.on_body),
         backgrounds=_backgrounds(depth), start=start, up=take.up, level=is_level(take),
         name=take.name,
-        sensors=_own_sensors(take, seen, body),
+        sensors=sensors_of(take, seen, body),
     )  # fmt: skip
     if seen.keypoints:
         bare = set(videos) <= set(seen.clicks) and not (marked or recording.sensors)  # else what is lifted adds nothing
@@ -198,28 +197,30 @@ def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict
     """Standard deviation of every sensor, [m] or [px]."""
     out = {entry.name: entry.sigma for entry in take.depth}
     out |= {entry.name: stereo_sigma(entry, video, seen) for entry, video in zip(take.stereo, stereo)}
-    out |= {f"silhouette {entry.camera}": entry.sigma for entry in take.silhouettes}
-    out |= {f"region {entry.camera}": entry.sigma for entry in take.regions if entry.sigma is not None}
+    out |= {name: sigma for of in seen.sensors for name, sigma in of.kind.sigma(of.entry).items()}
     out |= {f"clicks {video.sensor}": take.click_sigma for video in seen.clicks}
-    out |= {f"lines {entry.camera}": entry.sigma for entry in take.lines}
     out |= {entry.camera: entry.sigma for entry in (*take.skin, *take.keypoints)}
     return out | {sensor_name("markers", take.markers, k): entry.sigma for k, entry in enumerate(take.markers)}
 
 
-def _own_sensors(take: Take, seen: Observations, body: Body) -> tuple[Sensor, ...]:
-    """Sensors of tracked surfaces, which learn where on the body each point is, and of trackers on the body."""
-    out: list[Sensor] = [
-        SurfacePointSensor(v.sensor, slide=e.sigma) for e, v in zip(take.surface_points, seen.surface_points)
-    ]
-    for k, (entry, video) in enumerate(zip(take.trackers, seen.trackers)):
-        turn, mounts = np.radians(entry.rotation_sigma), {name: np.radians(m) for name, m in entry.mounts.items()}
-        with located(take.path, f"[[tracker]] {k + 1}"):
-            sensor = BodyTrackerSensor(
-                video.sensor, entry.points, sigma=entry.sigma, rotation_sigma=float(turn), mounts=mounts,
-                mount_sigma=float(np.radians(entry.mount_sigma)),
-            )  # fmt: skip
-            sensor.places(body, video.names)
-        out.append(sensor)
+def sensors_of(take: Take, seen: Observations, body: Body) -> tuple[Sensor, ...]:
+    """Sensors of all kinds of a take that track frames of their own.
+
+    Raises
+    ------
+    KinefitError
+        What making them raises, with the entry; PluginError for what a plug-in returns in place of a sensor.
+    """
+    out, numbers = list[Sensor](), Counter[str]()
+    for of in seen.sensors:
+        kind, name = of.kind, of.recording.sensor
+        numbers[kind.table] += 1
+        if kind.sensor is None:
+            continue
+        with located(take.path, f"[[{kind.table}]] {numbers[kind.table]}"):
+            valid = lambda s, name=name: isinstance(s, Sensor) and getattr(s, "name", None) == name
+            what = f"a Sensor of the name '{name}'"
+            out.append(kind.call("sensor", of.entry, of.recording, body, valid=valid, what=what))
     return tuple(out)
 
 

@@ -83,9 +83,9 @@ def track(
     if height is not None and not 0.3 < height < 3.0:
         raise ObservationError(f"height is {height:g} m", remedy="Give a height in metres, from 0.3 to 3.")
     settings = settings or TrackSettings()
-    foreign = [sensor for sensor in recording.sensors if type(sensor).__module__.partition(".")[0] != "kinefit"]
-    if checkpoint is not None and foreign:
-        problem = "a checkpoint cannot store the state of custom sensors"
+    packages = {type(sensor).__module__.partition(".")[0] for sensor in recording.sensors}
+    if checkpoint is not None and packages - checkpoint.packages:
+        problem = "a checkpoint cannot store the state of custom sensors that are no kinds of the take"
         raise ObservationError(problem, remedy="Leave out checkpoint.")
     known = Subject.as_is(body) if subject is None and not size else subject
     person = fitted_to_person(

@@ -11,9 +11,11 @@ from kinefit.exporters.c3d_file import write_markers
 from kinefit.observations import Markers
 from kinefit.readers.take.entries import RENAMED, TABLES, Take, keys_of
 from kinefit.readers.take.file import read_take
+from kinefit.readers.take.kinds import BUILT_IN
 from kinefit.readers.take.load import load_observations
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "take-file.md").read_text("utf-8")
+TABLES = [*TABLES, *BUILT_IN]
 KEYS = [(table, key) for table in TABLES for key in keys_of(table)]
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from kinefit.errors import FileError, KinefitError, ObservationError, TakeError
 from kinefit.readers.take.file import read_take
-from kinefit.readers.take.lines import read_lines
 from kinefit.readers.take.load import load_observations
+from kinefit.sensors.kinds.lines import read_lines
 
 CALIBRATION = """[cam]
 name = "cam"
@@ -35,7 +35,7 @@ def load(folder, lines=LINES, table=TABLE, camera="", head="rate = 30"):
 
 def test_lines_of_a_table(tmp_path):
     seen = load(tmp_path, LINES + "sigma = 1.5\n", camera="time_offset = 0.1")
-    (video,) = seen.lines
+    (video,) = seen.of_kind("lines")
     assert (seen.rate, seen.frames, video.sensor, video.names) == (30.0, (3, 7), "cam", ("hips", "back"))
     np.testing.assert_allclose(video.times, [0.1, 0.2])
     frame = video.frame(0)
@@ -50,7 +50,7 @@ def test_the_same_as_json_and_in_the_videos_picture(tmp_path):
     rows = [{"frame": 0, "line": "hips", "u1": 10, "v1": 20, "u2": 30, "v2": 40}]
     (tmp_path / "lines.json").write_text(json.dumps(rows))
     lines = LINES.replace(".csv", ".json") + 'frame = "video"\n'
-    (video,) = load(tmp_path, lines, camera='size = [128, 96]\nimage = "scaled"').lines
+    (video,) = load(tmp_path, lines, camera='size = [128, 96]\nimage = "scaled"').of_kind("lines")
     np.testing.assert_allclose(video.frame(0).ends[0], [[4.75, 9.75], [14.75, 19.75]])
     with pytest.raises(TakeError, match="not stated which the lines use"):
         load(tmp_path, LINES, camera='size = [128, 96]\nimage = "scaled"')

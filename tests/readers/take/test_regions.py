@@ -45,7 +45,7 @@ def test_a_rigid_thing_is_followed(tmp_path, scale):
     """Also in a video that is not of the calibration's size."""
     take, truth = written(tmp_path, scale=scale)
     motion, seen = track_take(take)
-    assert seen.regions[0].size == CAMERA.size and seen.regions[0].frame(0).size == CAMERA.size
+    assert seen.of_kind("region")[0].size == CAMERA.size and seen.of_kind("region")[0].frame(0).size == CAMERA.size
     for k, one in enumerate(truth):
         assert off(BodyState(motion.Ts_world_root[k], motion.angles[k]), one) < (0.012, 2.5)
     assert motion.quality.min() > 0.6 and "region cam" in motion.residuals
@@ -65,7 +65,7 @@ def test_sigma_is_the_sensors(tmp_path):
 @pytest.mark.parametrize("region, message", [
     ('[[region]]\ncamera = "cam"\nsigma = 0.0\n', "sigma = 0.0. Give a positive"),
     ('[[region]]\ncamera = "other"\n', "other"),
-    ('[[region]]\ncamera = "cam"\n[[region]]\ncamera = "cam"\n', "two regions"),
+    ('[[region]]\ncamera = "cam"\n[[region]]\ncamera = "cam"\n', r"two \[\[region\]\]"),
     ('[[region]]\ncamera = "cam"\nfile = "masks"\n', "file"),
     ('[[camera]]\nname = "blind"\n[[region]]\ncamera = "blind"\n', "blind"),
 ])  # fmt: skip
@@ -77,5 +77,5 @@ def test_what_cannot_be_is_refused(tmp_path, region, message):
 
 def test_colours_alone_do_not_begin_a_take(tmp_path):
     take, _ = written(tmp_path, start=False, count=1)
-    with pytest.raises(TakeError, match="colours alone"):
+    with pytest.raises(TakeError, match=r"\[\[region\]\]: it alone does not determine"):
         track_take(take.read_text() and take)

@@ -8,7 +8,7 @@ from kinefit.errors import FileError, ObservationError, TakeError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.take.silhouettes import read_silhouettes
+from kinefit.sensors.kinds.silhouettes import read_silhouettes
 from kinefit.takes.track import track_take
 
 
@@ -81,16 +81,21 @@ def test_a_take_with_silhouettes_alone(tmp_path):
     write_masks(tmp_path / "m")
     path = take(tmp_path, '[[silhouette]]\ncamera = "cam1"\nfile = "m"\nsigma = 2.0\n')
     told = read_take(path)
-    assert told.silhouettes[0].sigma == 2.0
+    assert told.sensors["silhouette"][0].sigma == 2.0
     seen = load_observations(told)
-    assert (seen.rate, seen.frames, len(seen.silhouettes)) == (30.0, (0, 3), 1)
-    (video,) = seen.silhouettes
+    assert (seen.rate, seen.frames, len(seen.of_kind("silhouette"))) == (30.0, (0, 3), 1)
+    (video,) = seen.of_kind("silhouette")
+    with pytest.warns(FutureWarning, match="'silhouettes' is Observations.of_kind"):
+        assert seen.silhouettes == (video,)
+    with pytest.warns(FutureWarning, match="'silhouettes' is Take.sensors"):
+        assert told.silhouettes == told.sensors["silhouette"]
+    assert not hasattr(seen, "no_such_attribute") and not hasattr(told, "no_such_attribute")
     assert video.frame(0).mask[20, 12] == 255
 
 
 def test_silhouettes_with_nothing_to_begin_with_are_refused(tmp_path):
     write_masks(tmp_path / "m")
-    with pytest.raises(TakeError, match="silhouettes alone do not determine the first pose"):
+    with pytest.raises(TakeError, match=r"\[\[silhouette\]\]: it alone does not determine the first pose"):
         track_take(take(tmp_path, '[[silhouette]]\ncamera = "cam1"\nfile = "m"\n'))
 
 

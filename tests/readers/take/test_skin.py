@@ -125,7 +125,7 @@ def test_what_cannot_be_is_told(folder):
 def test_silhouettes_by_colour(folder, channels, low, high):
     told = f'channels = "{channels}"\n' if channels else ""
     seen = load(folder, f'\n[[silhouette]]\ncamera = "cam"\nformat = "threshold"\nlow = {low}\nhigh = {high}\n{told}')
-    (video,) = seen.silhouettes
+    (video,) = seen.of_kind("silhouette")
     assert (len(video), seen.frames) == (20, (0, 20))
     mask = video.frame(7).mask
     truth = cv2.inRange(drawn(7), (200, 145, 120), (210, 155, 130))
@@ -146,7 +146,7 @@ def test_wrong_colours_are_told(folder):
 def test_silhouettes_before_the_background(folder):
     entry = '\n[[silhouette]]\ncamera = "cam"\nformat = "background"\nfile = "{}.png"\n'
     cv2.imwrite(str(folder / "empty.png"), np.full((240, 320, 3), WALL[::-1], np.uint8))
-    (video,) = load(folder, entry.format("empty")).silhouettes
+    (video,) = load(folder, entry.format("empty")).of_kind("silhouette")
     truth = np.any(drawn(7) != WALL, axis=2)
     assert np.count_nonzero((video.frame(7).mask > 127) != truth) < 0.1 * np.count_nonzero(truth)
     cv2.imwrite(str(folder / "small.png"), np.zeros((24, 32, 3), np.uint8))

@@ -164,7 +164,7 @@ def test_the_same_recording_goes_on_from_a_motion_file(body, rig, tmp_path):
         text += f'[[silhouette]]\ncamera = "{camera.name}"\nfile = "{camera.name}"\nsigma = 2.0\n'
     (tmp_path / "take.toml").write_text(text)
     motion, seen = track_take(tmp_path / "take.toml")
-    assert len(motion) == 6 and len(seen.silhouettes) == 4
+    assert len(motion) == 6 and len(seen.of_kind("silhouette")) == 4
     last = BodyState(motion.Ts_world_root[-1], motion.angles[-1])
     assert np.linalg.norm(joints(motion.body, last) - joints(body, truth[-1]), axis=1).mean() < 0.02
     assert "shape" not in motion.provenance  # the body is the motion's own

@@ -5,11 +5,13 @@ import pytest
 from tests.oracle import central_differences, design
 from tests.sensors.scenes import at, posture
 
+from kinefit import observations
 from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.body_surfaces import sample
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SurfacePointFrame
+from kinefit.sensors.kinds.surface_points import SurfacePointRecording
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.surface_points import SurfacePointSensor
 from kinefit.tracking.tracker import Tracker
@@ -156,3 +158,8 @@ def test_how_a_limb_was_turned_at_first_lasts():
     sensor.turns = {}
     exact = tracker.update([SurfacePointFrame("skin", 0.6, seen.ids, x, seen.covariance)])
     assert exact.dof_std[6 + turned] < 0.85 * min(stated)  # by what it says from frame to frame
+
+
+def test_the_old_name_of_the_recording_is_still_there():
+    with pytest.warns(FutureWarning, match="SurfacePointRecording now"):
+        assert observations.SurfacePointVideo is SurfacePointRecording

@@ -14,7 +14,7 @@ from kinefit.readers.guess.files import CalibrationFile
 CONFIDENCE_LEVELS = ("sure", "likely", "guess", "open")
 """From "stated by the files" to "the user decides"."""
 
-_TABLES = ("keypoints", "depth", "markers", "surface_points")  # in the order in which they are written
+_TABLES = ("keypoints", "depth", "markers")  # in the order in which they are written
 _COMMENT_COLUMN = 40
 _HEAD = """\
 # A first take file, made by kinefit init from what lies in the folder.
@@ -64,6 +64,7 @@ class Draft:
     others : calibrations that were not chosen.
     cameras : name -> keys of its [[camera]]
     tables : {"keypoints", "depth" ...: (True if in use, False if a comment; keys) of each entry}
+    kinds : {table: what it is} of tables of a `SensorKind`
     """
 
     folder: Path
@@ -74,6 +75,7 @@ class Draft:
     others: list[Path] = field(default_factory=list)
     cameras: dict[str, dict[str, Value]] = field(default_factory=dict)
     tables: dict[str, list[tuple[bool, Entry]]] = field(default_factory=lambda: {table: [] for table in _TABLES})
+    kinds: dict[str, str] = field(default_factory=dict)
     comments: list[str] = field(default_factory=list)
 
     def note(self, about: str, sure: str, text: str) -> None:
@@ -100,7 +102,10 @@ class Draft:
             parts.append(_table("[calibration]", self.calibration[1], self) + others)
         parts += [_table("[[camera]]", {"name": Value(name), **keys}, self) for name, keys in self.cameras.items()]
         for table, rows in self.tables.items():
-            parts += [_table(f"[[{table}]]", keys, self, active) for active, keys in rows]
+            title = f"[[{table}]]"
+            if table in self.kinds:
+                title = f"{title:<{_COMMENT_COLUMN - 2}}  # {self.kinds[table]}"
+            parts += [_table(title, keys, self, active) for active, keys in rows]
         return "\n".join(parts)
 
 

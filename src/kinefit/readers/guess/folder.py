@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kinefit.errors import CalibrationError, KinefitError, TakeError, command
+from kinefit.errors import CalibrationError, KinefitError, PluginError, TakeError, command
 from kinefit.geometry.camera import Rig
 from kinefit.readers.guess import files as guess_files
 from kinefit.readers.guess.cameras import describe_cameras, describe_uncalibrated
@@ -18,6 +18,8 @@ from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, Calibr
 from kinefit.readers.guess.names import trials
 from kinefit.readers.markers import read_markers
 from kinefit.readers.ros.images import Shown, mcap_rig, shown
+from kinefit.readers.take.entries import TABLES
+from kinefit.readers.take.kinds import Proposal, kind_names, kind_of, refuse_shadows
 
 _CALIBRATE = (
     "Calibrate with a board (kinefit calibrate board) or, if the cameras' intrinsics are known, from the person "
@@ -69,7 +71,8 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
     recordings = guess_files.find_recordings(files)
     for remark in remarks:
         draft.note("keypoints", "open", remark)
-    if not (videos or keypoints or markers or recordings):
+    _describe_kinds(draft, files)
+    if not (videos or keypoints or markers or recordings or any(draft.tables.values())):
         raise TakeError(
             f"no videos, keypoints, markers or recordings among {len(files)} files", file=folder,
             remedy="Name a folder with videos (.mp4, .avi ...) or keypoints and a calibration, or with .c3d, .trc or "
@@ -82,12 +85,26 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
     if recordings:
         describe_recordings(draft, recordings, alone=not (videos or keypoints or markers))
     _describe_markers(draft, markers)
-    for path in [file for file in files if file.name == "trajectories.csv"] if draft.cameras else []:
-        file = Value(path, "likely", "a surface that kinefit surface tracked; it needs a [start] or another sensor")
-        rows = draft.tables["surface_points"]
-        rows.append((not rows, {"file": draft.note_value("surface", file, "file")}))
     draft.comments.append(OPEN_HEIGHT)
     return Guess(draft.text(), tuple(draft.notes))
+
+
+def _describe_kinds(draft: Draft, files: Sequence[Path]) -> None:
+    """Enter what kinds of sensors find among files; a plug-in that fails becomes a note."""
+    for table in kind_names():
+        try:
+            refuse_shadows(table, TABLES)
+            kind, valid = kind_of(table), lambda found: all(isinstance(one, Proposal) and one.entry for one in found)
+            found = kind.call("propose", files, valid=valid, what="proposals with an entry") if kind.propose else []
+        except PluginError as error:
+            draft.note(table, "open", f"{error.problem}. {error.remedy or ''}".strip())
+            continue
+        for one in found:
+            (key, first), *more = one.entry.items()
+            entry = {key: draft.note_value(table, Value(first, "likely", one.reason), key)}
+            entry |= {name: Value(value) for name, value in more}
+            draft.tables.setdefault(table, []).append((one.used, entry))
+            draft.kinds[table] = kind.comment
 
 
 def _choose_calibration(

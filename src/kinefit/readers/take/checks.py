@@ -74,7 +74,7 @@ def _head(take: Take) -> _Odd:
             yield error.problem, "[take] person", error.remedy or ""
         has_start = take.start is not None or take.pose is not None  # where the body is, and so who
         if not (take.keypoints or (take.depth and not has_start)) and (
-            take.depth or take.stereo or take.markers or take.silhouettes or take.skin
+            take.depth or take.stereo or take.markers or take.skin or take.sensors
         ):
             what = "[[keypoints]] if a start is given" if has_start else "[[keypoints]] or [[depth]]"
             yield f"'person' has no use without {what}", "[take] person", "Remove it."
@@ -83,7 +83,7 @@ def _head(take: Take) -> _Odd:
             yield f"'{key}' has no use with start, which gives the body", f"[take] {key}", "Remove one of the two."
         if take.size is False and key != "size" and getattr(take, key) is not None:
             yield f"'{key}' has no use with size = false", f"[take] {key}", "Remove one of the two."
-    others = (take.silhouettes, take.markers, take.depth, take.stereo, take.lines, take.skin, take.trackers)
+    others = (take.markers, take.depth, take.stereo, take.skin, take.sensors)
     if take.calibration and take.calibration.position_sigma is not None and not take.keypoints and any(others):
         yield "position_sigma and rotation_sigma are for cameras with keypoints", "[calibration]", "Remove both."
 
@@ -106,9 +106,9 @@ def _pose(take: Take) -> _Odd:
 
 def _cameras(take: Take) -> _Odd:
     """There is something to see, by cameras whose places are known where they have to be."""
-    sensors = (take.keypoints, take.skin, take.silhouettes, take.regions)
-    places = (take.markers, take.surface_points, take.trackers, take.depth)
-    if not (take.cameras or any(sensors) or any(places)):
+    of_world = [one for entries in take.sensors.values() for one in entries if not hasattr(one, "camera")]
+    places = (take.markers, of_world, take.depth)
+    if not (take.cameras or take.keypoints or take.skin or take.sensors or any(places)):
         remedy = "Add [[camera]] with [[keypoints]], [[depth]], or [[markers]]."
         yield "an empty take: it names no sensor", "", remedy
     calibrated = take.calibration is not None
@@ -148,9 +148,9 @@ def _names(take: Take) -> _Odd:
             if side not in videos:
                 remedy = "Name two [[camera]] that have a video."
                 yield choices("camera with a video", side, videos), f"stereo {pair.name}", remedy
-    for kind, several in (("silhouettes", take.silhouettes), ("regions", take.regions)):
-        for camera in repeated(one.camera for one in several):  # type: ignore[attr-defined]
-            yield f"two {kind}", f"camera {camera}", "Remove one."
+    for table in ("silhouette", "region"):
+        for camera in repeated(one.camera for one in take.sensors.get(table, ())):
+            yield f"two [[{table}]]", f"camera {camera}", "Remove one."
 
 
 def _files_of_two(take: Take) -> _Odd:
@@ -159,7 +159,13 @@ def _files_of_two(take: Take) -> _Odd:
         (name, entry.file, sorted(getattr(entry, "points", ())),
          *(getattr(entry, key, None) for key in (("set",) if table == "markers" else ("format", "frames"))),
          getattr(entry, "set", None) == FACE_SET)
-        for table, name, entry in take.entries if table in ("keypoints", "markers", "surface_points", "tracker")
+        for table, name, entry in take.entries if table in ("keypoints", "markers")
+    ]  # fmt: skip
+    inputs += [
+        (name, entry.file, sorted(getattr(entry, "points", ())),
+         [value for key in keys_of(table) if isinstance(value := getattr(entry, key), str | bool)])
+        for table, name, entry in take.entries
+        if table in take.sensors and not hasattr(entry, "camera") and isinstance(getattr(entry, "file", None), Path)
     ]  # fmt: skip
     for one in inputs:
         if inputs.count(one) > 1:

@@ -7,10 +7,11 @@ say what to write; keys that need each other by `__post_init__`.
 from __future__ import annotations
 
 import datetime
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -18,22 +19,22 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from kinefit._files import LENGTHS, worth
-from kinefit.errors import TakeError, choices, located
+from kinefit.errors import choices, located
 from kinefit.geometry import se3
 from kinefit.observations import KEYPOINT_SIGMA
 from kinefit.readers.keypoint_sets import FACE_SET, KEYPOINT_SETS, MEDIAPIPE_SETS
+from kinefit.readers.take.kinds import TakeEntry, kind_of, refuse
 
 _Read = TypeVar("_Read")
-_Pixels = Annotated[float, Meta(gt=0, lt=1e4, description="Give a positive number of pixels.")]
-_Rate = Annotated[float, Meta(gt=0, lt=1e6, description="Give frames per second, a positive number, or remove it.")]
-_Metres = Annotated[float, Meta(gt=0, lt=1, description="Give metres, above 0 and below 1.")]
-_Seconds = Annotated[float, Meta(gt=-1e6, lt=1e6, description="Give seconds.")]
+Pixels = Annotated[float, Meta(gt=0, lt=1e4, description="Give a positive number of pixels.")]
+Rate = Annotated[float, Meta(gt=0, lt=1e6, description="Give frames per second, a positive number, or remove it.")]
+Metres = Annotated[float, Meta(gt=0, lt=1, description="Give metres, above 0 and below 1.")]
+Seconds = Annotated[float, Meta(gt=-1e6, lt=1e6, description="Give seconds.")]
 _Scale = Annotated[float, Meta(gt=0, lt=1e6, description="Give a positive number: unit in metres a count, times in s.")]
 _Number = Annotated[float, Meta(ge=-1e6, le=1e6, description="Give metres, directions and degrees.")]
 _Side = Annotated[int, Meta(ge=1, lt=100_000, description="Give [width, height] in pixels.")]
 _Shift = Annotated[float, Meta(gt=-1e4, lt=1e4, description="Give metres.")]
 _Turn = Annotated[float, Meta(ge=-360, le=360, description="Give degrees, at most 360.")]
-_Level = Annotated[int, Meta(ge=0, le=255, description="Give [r, g, b], 0 to 255 each.")]
 _Focal = Annotated[float, Meta(gt=0, description="Give [fx, fy, cx, cy] in pixels.")]
 _Length = Annotated[float, Meta(gt=0, description="Give [left, top, width, height] in pixels of the video.")]
 _Reach = Annotated[float, Meta(ge=0, description="Give [near, far] in metres.")]
@@ -48,32 +49,6 @@ _Counted = Annotated[
 ]
 
 
-class WrongEntryError(TakeError, ValueError):
-    """Keys of an entry that do not agree."""
-
-
-def _refuse(wrong: object, problem: str, remedy: str) -> None:
-    if wrong:
-        raise WrongEntryError(problem, remedy=remedy)
-
-
-class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table of the take file; paths are absolute once it is read."""
-
-    def _uses(self, given: str, only: Mapping[str, Sequence[str]]) -> None:
-        """Refuse keys that mean nothing with the entry's format; `only`: {key: formats}."""
-        for key, formats in only.items():
-            odd = getattr(self, key) not in (None, ()) and given not in formats
-            _refuse(odd, f"'{key}' has no use with format = \"{given}\"", f"Remove it; it is for {', '.join(formats)}.")
-
-    def _ordered(self, *keys: str) -> None:
-        """Refuse ranges (first, last) that are none."""
-        for key in keys:
-            value = getattr(self, key) or ()
-            for one in value if value and isinstance(value[0], tuple) else (value,):
-                _refuse(one and not one[0] < one[1], f"{key} has {list(one)}", "Give the lesser number first.")
-
-
 SKIN_SETS = ("HANDS", "WRISTS")
 """Which points of the body the skin's patches are: middles of the hands, or wrists of a body without fingers."""
 
@@ -83,17 +58,18 @@ RENAMED: dict[str, dict[str, str]] = {
 """{table: {old key: new key}}: old keys are read with a warning in this version, and are unknown in the next."""
 
 
-class StartEntry(_Entry, frozen=True, kw_only=True):
+class StartEntry(TakeEntry, frozen=True, kw_only=True):
     """`[start]`: where the body is at one step, for sensors that alone cannot find it."""
 
     at: tuple[_Number, _Number, _Number] | None = None  # [m] of the root's origin in the world; of clicks alone: none
     forward: tuple[_Number, _Number, _Number] | None = None  # direction in the world in which the root's x looks
     upward: tuple[_Number, _Number, _Number] | None = None  # and its y; default: the take's `up`
-    angles: dict[str, _Number] = {}  # [deg] or, of joints that slide, [m]; others are the body's usual ones
+    angles: dict[str, _Number] = msgspec.field(default_factory=dict)  # [deg] or, of joints that slide, [m]; others are
+    # those of the default pose
     step: int | None = None  # of the common time; default: the first
     low_pass: bool = True  # whether silhouettes are also fitted with low-pass approximations of the surface first
     clicks: Path | None = None  # joints clicked at any steps, which are measurements of their steps
-    click_sigma: _Pixels = 3.0  # [px] standard deviation of a click along each axis, in the calibration's image
+    click_sigma: Pixels = 3.0  # [px] standard deviation of a click along each axis, in the calibration's image
 
     @property
     def is_clicks_alone(self) -> bool:
@@ -101,7 +77,7 @@ class StartEntry(_Entry, frozen=True, kw_only=True):
         return self.clicks is not None and self == StartEntry(clicks=self.clicks, click_sigma=self.click_sigma)
 
 
-class SessionEntry(_Entry, frozen=True, kw_only=True):
+class SessionEntry(TakeEntry, frozen=True, kw_only=True):
     """`[session]`: subject and movement of the recording, for the report; nothing is computed from it."""
 
     subject: str = ""  # a code rather than a name
@@ -119,7 +95,7 @@ class SessionEntry(_Entry, frozen=True, kw_only=True):
         return {k: str(v) for k in self.__struct_fields__ if (v := getattr(self, k)) and k != "norms"}
 
 
-class CalibrationEntry(_Entry, frozen=True, kw_only=True):
+class CalibrationEntry(TakeEntry, frozen=True, kw_only=True):
     """`[calibration]`: where the cameras stood."""
 
     file: Path
@@ -131,10 +107,10 @@ class CalibrationEntry(_Entry, frozen=True, kw_only=True):
         both = self.position_sigma, self.rotation_sigma
         problem = "position_sigma {}, rotation_sigma {}".format(*both)
         remedy = "Give metres and degrees above 0, or 0 and 0 for an exact calibration, or neither."
-        _refuse(both not in ((None, None), (0, 0)) and not all(both), problem, remedy)
+        refuse(both not in ((None, None), (0, 0)) and not all(both), problem, remedy)
 
 
-class CameraEntry(_Entry, frozen=True, kw_only=True):
+class CameraEntry(TakeEntry, frozen=True, kw_only=True):
     """`[[camera]]`: one camera of the calibration, with its video or the size of its image."""
 
     name: str
@@ -144,14 +120,14 @@ class CameraEntry(_Entry, frozen=True, kw_only=True):
     size: tuple[_Side, _Side] | None = None  # [px] (width, height) of the image; default: the video's
     image: Literal["as calibrated", "scaled", "letterboxed"] = "as calibrated"  # what became of the image
     rotation: Literal[0, 90, 180, 270] = 0  # [deg] the image is the calibration's, turned clockwise
-    time_offset: _Seconds = 0.0  # [s] added to frame / rate
+    time_offset: Seconds = 0.0  # [s] added to frame / rate
     field_of_view: _View | None = None  # [deg] across the longer side, of a camera of a take without calibration
 
     def __post_init__(self) -> None:
-        _refuse(self.stream is not None and self.video is not None, "a stream and a video", "Remove one of the two.")
+        refuse(self.stream is not None and self.video is not None, "a stream and a video", "Remove one of the two.")
 
 
-class KeypointsEntry(_Entry, frozen=True, kw_only=True):
+class KeypointsEntry(TakeEntry, frozen=True, kw_only=True):
     """`[[keypoints]]`: what a detector saw in one camera."""
 
     camera: str
@@ -160,8 +136,8 @@ class KeypointsEntry(_Entry, frozen=True, kw_only=True):
     format: Literal["openpose", "mediapipe", "caliscope", "detect", "skin"] = "openpose"
     set: str | None = None  # default: BODY_25B of openpose, MEDIAPIPE_33 of mediapipe, HANDS of skin
     frame: Literal["calibration", "video"] | None = None  # image frame of the coordinates; needed where the two differ
-    rate: _Rate | None = None  # [Hz]; default: the camera's video, or the take
-    sigma: _Pixels = KEYPOINT_SIGMA  # [px] standard deviation, in the calibration's image
+    rate: Rate | None = None  # [Hz]; default: the camera's video, or the take
+    sigma: Pixels = KEYPOINT_SIGMA  # [px] standard deviation, in the calibration's image
     frames: tuple[_Step, _Step] | None = None  # steps (start, stop) at which they count; default: all
     excluded: tuple[tuple[_Counted, _Counted], ...] = ()  # ranges (start, stop) of steps at which they do not count
     swapped: tuple[tuple[_Counted, _Counted], ...] = ()  # ranges (start, stop) of steps at which left is right
@@ -177,83 +153,22 @@ class KeypointsEntry(_Entry, frozen=True, kw_only=True):
         known = sets.get(self.format, MEDIAPIPE_SETS)
         kind = "keypoint set" if self.format == "openpose" else f"keypoint set of {self.format}"
         odd = self.set is not None and self.set not in known
-        _refuse(odd, choices(kind, str(self.set), known), f'Use set = "{known[0]}", or remove it.')
+        refuse(odd, choices(kind, str(self.set), known), f'Use set = "{known[0]}", or remove it.')
         none = self.file is None and self.stream is None and self.format not in ("detect", "skin")
-        _refuse(none, f"no file of {self.format} keypoints", 'Write file = "...", or format = "detect".')
+        refuse(none, f"no file of {self.format} keypoints", 'Write file = "...", or format = "detect".')
         self._ordered("frames", "excluded", "swapped")
         if self.stream is not None:
-            _refuse(self.file is not None, "a stream and a file", "Remove one of the two.")
+            refuse(self.file is not None, "a stream and a file", "Remove one of the two.")
             for key in ("excluded", "swapped"):
-                _refuse(getattr(self, key), f"'{key}' has no use with a stream", "Leave it out.")
+                refuse(getattr(self, key), f"'{key}' has no use with a stream", "Leave it out.")
 
 
-class SilhouetteEntry(_Entry, frozen=True, kw_only=True):
-    """`[[silhouette]]`: which pixels of one camera show the person."""
-
-    camera: str
-    file: Path | None = None  # of "masks": folder or pattern; of "background": image of the empty scene
-    format: Literal["masks", "background", "threshold", "detect"] = "masks"
-    frame: Literal["calibration", "video"] | None = None  # image frame of the masks; needed where the two differ
-    rate: _Rate | None = None  # [Hz] of the masks; default: the camera's video, or the take
-    sigma: _Pixels = 4.0  # [px] standard deviation of an outline, in the calibration's image
-    low: tuple[_Level, _Level, _Level] | None = None  # of "threshold": least value of each channel that is the body's
-    high: tuple[_Level, _Level, _Level] | None = None  # and the largest
-    channels: Literal["rgb", "hsv", "lab", "ycrcb"] | None = None  # of low and high, 8 bits each; default: rgb
-    smooth: _Pixels | None = None  # [px] of the Gaussian before the Laplace operator; default: 1
-
-    def __post_init__(self) -> None:
-        self._uses(self.format, {
-            "file": ("masks", "background", "detect"), "frame": ("masks",), "rate": ("masks",),
-            **dict.fromkeys(("low", "high", "channels", "smooth"), ("threshold",)),
-        })  # fmt: skip
-        none = self.file is None and self.format == "masks"
-        _refuse(none, "no file of masks", 'Write file = "..." (a folder), or another format.')
-        if self.format == "threshold":
-            remedy = "Write low = [r, g, b] and high = [r, g, b], 0 to 255 each."
-            _refuse(self.low is None or self.high is None, "no colour of the body", remedy)
-            odd = any(a > b for a, b in zip(self.low or (), self.high or ()))
-            _refuse(odd, f"low = {self.low}, high = {self.high}", "Give 0 to 255, the lower ones first.")
-
-
-class RegionEntry(_Entry, frozen=True, kw_only=True):
-    """`[[region]]`: a camera in whose video the body is followed by the colours inside and outside of its contour."""
-
-    camera: str
-    sigma: _Pixels | None = None  # [px] standard deviation of the contour, shape included; default: as the body is made
-
-
-class LinesEntry(_Entry, frozen=True, kw_only=True):
-    """`[[lines]]`: image lines in one camera on which points or edges of the body lie."""
-
-    camera: str
-    file: Path  # table of frame, line, u1, v1, u2, v2 [px]
-    landmarks: dict[str, tuple[str, ...]]  # of each line: two ends of an edge of the body, or one point
-    frame: Literal["calibration", "video"] | None = None  # image frame of the lines; needed where the two differ
-    rate: _Rate | None = None  # [Hz]; default: the camera's video, or the take
-    sigma: _Pixels = 2.0  # [px] standard deviation, in the calibration's image
-
-    def __post_init__(self) -> None:
-        example = 'Write landmarks = { edge = ["r_asis", "l_asis"] }, one entry for each line.'
-        _refuse(not self.landmarks, "no landmarks", example)
-        for name, own in self.landmarks.items():
-            odd = not 1 <= len(set(own)) == len(own) <= 2
-            _refuse(odd, f"line '{name}' has {len(own)} landmarks", "Give the two ends of an edge, or one point.")
-
-
-class SurfacePointsEntry(_Entry, frozen=True, kw_only=True):
-    """`[[surface_points]]`: a surface that was tracked, such as by `kinefit surface`."""
-
-    file: Path  # table of time_s, point, x, y, z, std_x, std_y, std_z [s, m]
-    time_offset: _Seconds = 0.0  # [s]
-    sigma: _Metres = 0.01  # [m] standard deviation by which the surface slides on the bone, and the body's shape is off
-
-
-class _PlacedEntry(_Entry, frozen=True, kw_only=True):
+class PlacedEntry(TakeEntry, frozen=True, kw_only=True):
     """A file of places in a world of its own."""
 
     file: Path
-    time_offset: _Seconds = 0.0  # [s]
-    sigma: _Metres = 0.005  # [m] standard deviation
+    time_offset: Seconds = 0.0  # [s]
+    sigma: Metres = 0.005  # [m] standard deviation
     shift: tuple[_Shift, _Shift, _Shift] = (0.0, 0.0, 0.0)  # [m] of the file's origin, in the world
     turn: tuple[_Turn, _Turn, _Turn] = (0.0, 0.0, 0.0)  # [deg] rotation vector, from the file's axes to the world's
 
@@ -263,7 +178,7 @@ class _PlacedEntry(_Entry, frozen=True, kw_only=True):
         return se3.transform(se3.exp_so3(np.radians(self.turn)), np.array(self.shift))
 
 
-class MarkersEntry(_PlacedEntry, frozen=True, kw_only=True):
+class MarkersEntry(PlacedEntry, frozen=True, kw_only=True):
     """`[[markers]]`: a marker recording."""
 
     unit: str | None = None  # where the file does not state it
@@ -273,19 +188,10 @@ class MarkersEntry(_PlacedEntry, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         odd = self.unit is not None and worth(self.unit, LENGTHS) is None
-        _refuse(odd, choices("unit", str(self.unit), LENGTHS), "Use one of these.")
+        refuse(odd, choices("unit", str(self.unit), LENGTHS), "Use one of these.")
 
 
-class TrackerEntry(_PlacedEntry, frozen=True, kw_only=True):
-    """`[[tracker]]`: trackers fixed on the body, such as magnetic ones: poses of segments, or places of points."""
-
-    points: dict[str, str]  # of each tracker of the file: landmark of the body, or segment, whose origin it then is
-    mounts: dict[str, tuple[float, float, float]] = {}  # [deg] rotation vector, from a tracker's axes to its segment's
-    rotation_sigma: float = 2.0  # [deg] standard deviation of an orientation
-    mount_sigma: float = 0.0  # [deg] standard deviation of the mounts, which are then estimated; default: exact
-
-
-class DepthEntry(_Entry, frozen=True, kw_only=True):
+class DepthEntry(TakeEntry, frozen=True, kw_only=True):
     """`[[depth]]`: a depth sensor."""
 
     name: str
@@ -298,10 +204,10 @@ class DepthEntry(_Entry, frozen=True, kw_only=True):
     range: tuple[_Reach, _Reach] | None = None  # [m] (near, far): what is measured outside of it is dropped
     intrinsics: tuple[_Focal, _Focal, float, float] | None = None  # [px] fx, fy, cx, cy, in a take without calibration
     distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] beside the intrinsics
-    rate: _Rate | None = None  # [Hz]; default: what the file states, the take's, the videos'
+    rate: Rate | None = None  # [Hz]; default: what the file states, the take's, the videos'
     time_unit: _Scale | None = None  # [s] of the last number in every file's name, where that is the time
-    time_offset: _Seconds = 0.0  # [s] time of the first frame
-    sigma: _Metres = 0.01  # [m] standard deviation of a depth
+    time_offset: Seconds = 0.0  # [s] time of the first frame
+    sigma: Metres = 0.01  # [m] standard deviation of a depth
     background: Path | None = None  # the same sensor before the empty scene
     on_body: bool = False  # everything but the body was taken out already
     segment: str | None = None  # of clouds of points: the one segment of the body that they are on
@@ -309,19 +215,19 @@ class DepthEntry(_Entry, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         problem = "neither a file nor a stream" if self.file is None else "a stream and a file"
         remedy = 'Write file = "...", or, for `kinefit live`, stream = "FOLDER".'
-        _refuse((self.stream is None) == (self.file is None), problem, remedy)
+        refuse((self.stream is None) == (self.file is None), problem, remedy)
         if self.stream is not None:
             for key in ("time_unit", "segment"):
-                _refuse(getattr(self, key) is not None, f"'{key}' has no use with a stream", "Remove it.")
+                refuse(getattr(self, key) is not None, f"'{key}' has no use with a stream", "Remove it.")
             unsized = self.intrinsics is not None and self.size is None
             remedy = "Write size = [width, height] of its images."
-            _refuse(unsized, "a stream with intrinsics, and no size", remedy)
+            refuse(unsized, "a stream with intrinsics, and no size", remedy)
         bare = self.distortion and self.intrinsics is None
-        _refuse(bare, "distortion without intrinsics", "Write intrinsics = [fx, fy, cx, cy] too.")
+        refuse(bare, "distortion without intrinsics", "Write intrinsics = [fx, fy, cx, cy] too.")
         self._ordered("range")
 
 
-class StereoEntry(_Entry, frozen=True, kw_only=True):
+class StereoEntry(TakeEntry, frozen=True, kw_only=True):
     """`[[stereo]]`: two cameras of the take whose videos give depth."""
 
     left: str
@@ -331,7 +237,7 @@ class StereoEntry(_Entry, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         self._ordered("range")
-        _refuse(self.left == self.right, "left and right are one camera", "Name two cameras.")
+        refuse(self.left == self.right, "left and right are one camera", "Name two cameras.")
 
     @property
     def name(self) -> str:
@@ -370,7 +276,7 @@ class TakeHead:
     """
 
     name: str = ""
-    rate: _Rate | None = None
+    rate: Rate | None = None
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
     body: str = "humanoid"
     height: _Stature | None = None
@@ -380,6 +286,20 @@ class TakeHead:
     size: bool | None = None
     frames: tuple[_Step, _Step] | None = None
     hide_faces: bool = False
+
+
+_OLD_ATTRIBUTES = {
+    "silhouettes": "silhouette", "regions": "region", "lines": "lines", "surface_points": "surface_points",
+}  # fmt: skip
+"""{attribute of a `Take` and its `Observations` in 0.2: its table}"""
+
+
+def old_attribute(name: str, successor: str) -> str:
+    """The table that an attribute of 0.2 is of, with a warning; AttributeError if it was none."""
+    if name not in _OLD_ATTRIBUTES:
+        raise AttributeError(name)
+    warnings.warn(f"'{name}' is {successor} by the name of its table now", FutureWarning, stacklevel=3)
+    return _OLD_ATTRIBUTES[name]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -393,8 +313,9 @@ class Take(TakeHead):
     session : SessionEntry, subject and movement of the recording
     placed : StartEntry or None, `[start]`
     calibration : CalibrationEntry or None
-    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines, surface_points, trackers : tuples
+    cameras, keypoints, markers, depth, stereo, skin : tuples
         Of entries; `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
+    sensors : {table: entries} of all other kinds, see `SensorKind`
     digest : str
         SHA-256 of the file's tables as they are written, without comments and spacing; "" for a take of no file.
     """
@@ -409,18 +330,19 @@ class Take(TakeHead):
     markers: tuple[MarkersEntry, ...] = ()
     depth: tuple[DepthEntry, ...] = ()
     stereo: tuple[StereoEntry, ...] = ()
-    silhouettes: tuple[SilhouetteEntry, ...] = ()
-    regions: tuple[RegionEntry, ...] = ()
     skin: tuple[KeypointsEntry, ...] = ()
-    lines: tuple[LinesEntry, ...] = ()
-    surface_points: tuple[SurfacePointsEntry, ...] = ()
-    trackers: tuple[TrackerEntry, ...] = ()
+    sensors: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Keypoints by colour apart from others."""
         if skin := tuple(entry for entry in self.keypoints if entry.format == "skin"):
             object.__setattr__(self, "skin", (*self.skin, *skin))
             object.__setattr__(self, "keypoints", tuple(entry for entry in self.keypoints if entry.format != "skin"))
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            return self.sensors.get(old_attribute(name, "Take.sensors"), ())
 
     @property
     def pose(self) -> StartEntry | None:
@@ -450,34 +372,43 @@ class Take(TakeHead):
             found = self if table == "take" else getattr(self, ATTRIBUTES.get(table, table))
             of_table = found if isinstance(found, tuple) else () if found is None else (found,)
             for entry in (*of_table, *(self.skin if table == "keypoints" else ())):
-                yield table, _name_of(table, entry), entry
+                yield table, title_of(table, entry), entry
+        for table, entries in self.sensors.items():
+            for entry in entries:
+                yield table, title_of(table, entry), entry
 
 
 TABLES: dict[str, type[Any]] = {
     "take": TakeHead, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry,
     "camera": CameraEntry, "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry,
-    "stereo": StereoEntry, "silhouette": SilhouetteEntry, "region": RegionEntry, "lines": LinesEntry,
-    "surface_points": SurfacePointsEntry, "tracker": TrackerEntry,
+    "stereo": StereoEntry,
 }  # fmt: skip
-"""Every table of a take file, and its keys as the fields of a record."""
-ATTRIBUTES = {
-    "start": "placed", "camera": "cameras", "silhouette": "silhouettes", "region": "regions", "tracker": "trackers",
-}  # fmt: skip
+"""Tables of a take file without those of `SensorKind`s, and their keys as the fields of a record."""
+ATTRIBUTES = {"start": "placed", "camera": "cameras"}
 """{table: attribute of a `Take`} where they differ; the keys of [take] are attributes themselves."""
 SINGLE_TABLES = ("take", "session", "start", "calibration")
 
 
+def entry_class(table: str) -> type[Any]:
+    """The record of a table's entries."""
+    return TABLES.get(table) or kind_of(table).entry
+
+
 def keys_of(table: str) -> tuple[str, ...]:
     """All keys of a table."""
-    record = TABLES[table]
+    record = entry_class(table)
     return tuple(getattr(record, "__struct_fields__", None) or record.__dataclass_fields__)
 
 
-def _name_of(table: str, entry: Any) -> str:
+def title_of(table: str, entry: Any) -> str:
+    """Name of an entry in messages."""
     if table in SINGLE_TABLES:
         return f"[{table}]"
     if table not in ("camera", "depth", "stereo"):
-        return f"{table} of camera {entry.camera}" if hasattr(entry, "camera") else f"{table} {entry.file.name}"
+        if hasattr(entry, "camera"):
+            return f"{table} of camera {entry.camera}"
+        file = getattr(entry, "file", None)
+        return f"{table} {file.name}" if isinstance(file, Path) else table
     return f"{table} {entry.name}"
 
 

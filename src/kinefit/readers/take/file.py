@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from os import PathLike
@@ -35,8 +36,15 @@ from kinefit.readers.take.entries import (
     SINGLE_TABLES,
     TABLES,
     Take,
-    WrongEntryError,
+    entry_class,
     keys_of,
+)
+from kinefit.readers.take.kinds import (
+    BUILT_IN,
+    PLUGIN_COMMENT,
+    WrongEntryError,
+    kind_names,
+    refuse_shadows,
 )
 
 __all__ = ["Take", "read_take"]
@@ -56,20 +64,27 @@ def read_take(path: str | PathLike[str]) -> Take:
     path = find_take(path).absolute()
     if not path.exists():
         raise FileError("no such take file", file=path, remedy="Check the path.")
-    raw = parse_toml(read_text(path, "the take file", remedy="Give a text file in UTF-8."), path)
+    text = read_text(path, "the take file", remedy="Give a text file in UTF-8.")
+    raw = parse_toml(text, path)
     digest = hashlib.sha256(json.dumps(raw, sort_keys=True, default=str).encode()).hexdigest()
-    _tidy(raw, path)
+    _tidy(raw, path, text)
     head = raw.pop("take", {}) | {"path": path, "digest": digest}
     head["name"] = head.get("name") or printable(path.stem)
     if isinstance(body := head.get("body"), str) and body.endswith((".toml", ".npz")):
         head["body"] = str(path.parent / body)
-    content = head | {ATTRIBUTES.get(table, table): rows for table, rows in raw.items()}
-    try:
-        take = msgspec.convert(content, Take, dec_hook=_path_in(path.parent))
-    except msgspec.ValidationError as error:
-        raise wrong_value(error, content, path) from error
+    of_kinds = {table: entry_class(table) for table in kind_names() if table in raw}
+    head["sensors"] = {t: _converted({t: raw.pop(t)}, tuple[of_kinds[t], ...], path, t) for t in of_kinds}  # type: ignore
+    take: Take = _converted(head | {ATTRIBUTES.get(table, table): rows for table, rows in raw.items()}, Take, path)
     check_take(take)
     return take
+
+
+def _converted(content: Mapping[str, Any], kind: Any, path: Path, table: str = "") -> Any:
+    """Content of a take file, or of one of its tables, as records of a kind; raises what `wrong_value` makes."""
+    try:
+        return msgspec.convert(content[table] if table else content, kind, dec_hook=_path_in(path.parent))
+    except msgspec.ValidationError as error:
+        raise wrong_value(error, content, path, table) from error
 
 
 _MAX_PATH_BYTES = 2048  # bytes of a path within a take: systems allow 4096 in all
@@ -92,10 +107,13 @@ def _path_in(folder: Path) -> Callable[[type, Any], Path]:
     return make
 
 
-def _tidy(raw: dict[str, Any], path: Path) -> None:
+def _tidy(raw: dict[str, Any], path: Path, text: str) -> None:
     """Name an unknown table or key, and what exists; put new names of keys, metres and topics in place."""
     for table, content in raw.items():
-        check_choice("sensor or table", table, TABLES, TakeError, file=path, place=f"[{table}]")
+        with located(path, f"[{table}]"):
+            remedy = None if table in TABLES else _plugin_for(table, text)
+            check_choice("sensor or table", table, [*TABLES, *kind_names()], TakeError, remedy=remedy)
+            refuse_shadows(table, TABLES)
         many = table not in SINGLE_TABLES
         if many != isinstance(content, list):
             wanted = f"[[{table}]]" if many else f"[{table}]"
@@ -112,12 +130,19 @@ def _tidy(raw: dict[str, Any], path: Path) -> None:
                     _name_topic(topic, row, "video" if table == "camera" else "file", path)
 
 
+def _plugin_for(table: str, text: str) -> str:
+    """What to install for a table of a plug-in: the distribution that `kinefit init` wrote beside the table's name."""
+    noted = re.search(rf"^\[\[{re.escape(table)}\]\]\s*#\s*{PLUGIN_COMMENT}(\S+)", text, re.MULTILINE)
+    what = noted[1] if noted else "the package that reads it"
+    return f"Correct the name, or install the plug-in that reads [[{table}]]: {sys.executable} -m pip install {what}."
+
+
 def _rename(table: str, row: dict[str, Any], path: Path, place: str) -> None:
     """Put the new name of a key in place of its old one, and say so; refuse one that there is not."""
     known, old_names = keys_of(table), RENAMED.get(table, {})
     for old in [key for key in row if key not in known]:
         if old not in old_names:
-            tables = [name for name in TABLES if old in keys_of(name)]
+            tables = [name for name in (*TABLES, *BUILT_IN) if old in keys_of(name)]
             holding = ", ".join(f"[{name}]" if name in SINGLE_TABLES else f"[[{name}]]" for name in tables)
             raise TakeError(choices("key", old, known), remedy=f"'{old}' belongs to {holding}." if holding else None)
         new = old_names[old]
@@ -188,7 +213,8 @@ def is_take(file: Path) -> bool:
         tables = parse_toml(read_text(file, "it", remedy=""), file)
     except KinefitError:
         return False
-    return bool(set(tables) - {"calibration"}) and not set(tables) - set(TABLES)  # which calibrations have, too
+    known = {*TABLES, *kind_names()}
+    return bool(set(tables) - {"calibration"}) and not set(tables) - known  # which calibrations have, too
 
 
 _WORDS = {
@@ -197,11 +223,14 @@ _WORDS = {
 }  # fmt: skip
 
 
-def wrong_value(error: msgspec.ValidationError, content: Mapping[str, Any], path: Path) -> TakeError:
-    """The error of a value that a table of a take file cannot have; `content` is what could not become a `Take`."""
-    message, _, at = str(error).partition(" - at `$.")
-    attribute, *inner = re.findall(r"\w+", at) or [""]
-    table = {ATTRIBUTES.get(name, name): name for name in TABLES if name != "take"}.get(attribute, "take")
+def wrong_value(error: msgspec.ValidationError, content: Mapping[str, Any], path: Path, of: str = "") -> TakeError:
+    """The error of a value that a table of a take file cannot have; `content` is what could not become a `Take`.
+
+    `of`: the table of a kind, if its rows alone were converted.
+    """
+    message, _, at = str(error).partition(" - at `$")
+    attribute, *inner = [*([of] if of else []), *re.findall(r"\w+", at)] or [""]
+    table = of or {ATTRIBUTES.get(name, name): name for name in TABLES if name != "take"}.get(attribute, "take")
     if table in SINGLE_TABLES:
         row, keys = (content, [attribute]) if table == "take" else (content[attribute], inner)
         key, where = next(iter(keys), ""), f"[{table}]"
@@ -215,7 +244,7 @@ def wrong_value(error: msgspec.ValidationError, content: Mapping[str, Any], path
         place = f"{where}, {key}" if key else where
     if isinstance(cause := error.__cause__, WrongEntryError):
         return TakeError(cause.problem, file=path, place=where, remedy=cause.remedy)
-    hints = list(_parts(get_type_hints(TABLES[table], include_extras=True).get(key)))
+    hints = list(_parts(get_type_hints(entry_class(table), include_extras=True).get(key)))
     listed = next((", ".join(map(repr, get_args(hint))) for hint in hints if get_origin(hint) is Literal), "")
     if re.match(r"Expected `\w+` [<>]", message):
         remedy = next(m.description for hint in hints for m in getattr(hint, "__metadata__", ()))

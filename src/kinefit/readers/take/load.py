@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,17 +18,14 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import (
     MEDIAPIPE_33,
-    BodyTrackerVideo,
     ClickVideo,
     CloudVideo,
-    ColourVideo,
     DepthVideo,
     Keypoints,
     KeypointVideo,
     LineVideo,
     Markers,
-    SilhouetteVideo,
-    SurfacePointVideo,
+    SensorRecording,
 )
 from kinefit.observations.clocks import frame_times, is_even, on_steps
 from kinefit.readers.calibration.read import found_notes
@@ -48,25 +45,32 @@ from kinefit.readers.take.cameras import (
     what_is_assumed,
 )
 from kinefit.readers.take.checks import refuse_streams
+from kinefit.readers.take.clicks import load_clicks
 from kinefit.readers.take.depth import depth_notes, load_depth
 from kinefit.readers.take.entries import (
     KeypointsEntry,
     MarkersEntry,
-    SurfacePointsEntry,
     Take,
-    TrackerEntry,
+    old_attribute,
     read_each,
     sensor_name,
+    title_of,
 )
-from kinefit.readers.take.lines import load_clicks, load_lines
-from kinefit.readers.take.silhouettes import load_region, load_silhouettes, load_skin
-from kinefit.readers.tracked_points import read_body_trackers, read_surface_points
+from kinefit.readers.take.kinds import SensorKind, kind_of
+from kinefit.readers.take.skin import load_skin
 from kinefit.readers.video import Video, common_frames
 
-_Timed = DepthVideo | CloudVideo | LineVideo | SurfacePointVideo | BodyTrackerVideo
-_Whole = _Timed | SilhouetteVideo | ColourVideo | KeypointVideo
 _MIN_COMMON_FRAMES = 10  # without a calibration: fewer tell neither clocks nor places of cameras
 _LEVEL = 45.0  # [deg] turned by less, the axis of a marker file that was vertical still is the nearest to it
+
+
+@dataclass(frozen=True, eq=False)
+class TakeSensor:
+    """A sensor of a take: its kind, its entry and what it recorded."""
+
+    kind: SensorKind
+    entry: Any
+    recording: SensorRecording
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,20 +95,12 @@ class Observations:
         In the order of `take.depth`, whole, at their own rates; those whose files are images.
     clouds : tuple of CloudVideo
         Those whose files are points without order.
-    silhouettes : tuple of SilhouetteVideo
-        In the order of `take.silhouettes`, whole, at their own rates.
-    regions : tuple of ColourVideo
-        In the order of `take.regions`, whole, at their own rates.
     skin : tuple of KeypointVideo
         In the order of `take.skin`: face and hands by colour, followed as their frames are asked for.
-    lines : tuple of LineVideo
-        In the order of `take.lines`, those frames that have lines.
     clicks : tuple of ClickVideo
         Clicked joints, by camera, of cameras with clicks at `frames`.
-    surface_points : tuple of SurfacePointVideo
-        In the order of `take.surface_points`, whole, at their own rates.
-    trackers : tuple of BodyTrackerVideo
-        In the order of `take.trackers`, whole, at their own rates.
+    sensors : tuple of TakeSensor
+        Of `take.sensors`, whole, at their own rates.
     notes : tuple of str
         What is worth saying: depth of another rate, frames that are missing.
     first_time : float [s]
@@ -120,44 +116,48 @@ class Observations:
     images: dict[str, ImageFrame]
     depth: tuple[DepthVideo, ...] = ()
     clouds: tuple[CloudVideo, ...] = ()
-    silhouettes: tuple[SilhouetteVideo, ...] = ()
-    regions: tuple[ColourVideo, ...] = ()
     skin: tuple[KeypointVideo, ...] = ()
-    lines: tuple[LineVideo, ...] = ()
     clicks: tuple[ClickVideo, ...] = ()
-    surface_points: tuple[SurfacePointVideo, ...] = ()
-    trackers: tuple[BodyTrackerVideo, ...] = ()
+    sensors: tuple[TakeSensor, ...] = ()
     notes: tuple[str, ...] = ()
     first_time: float = 0.0
 
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            return self.of_kind(old_attribute(name, "Observations.of_kind"))
+
     @property
-    def recordings(
-        self,
-    ) -> tuple[_Whole, ...]:
+    def recordings(self) -> tuple[SensorRecording, ...]:
         """Every recording with `at_step(step, rate)` and `frame(i)`: all but keypoints and markers."""
-        return (
-            *self.depth, *self.clouds, *self.silhouettes, *self.regions, *self.skin, *self.lines, *self.clicks,
-            *self.surface_points, *self.trackers,
-        )  # fmt: skip
+        of_kinds = (sensor.recording for sensor in self.sensors)
+        return (*self.depth, *self.clouds, *of_kinds, *self.skin, *self.clicks)
+
+    def of_kind(self, table: str) -> tuple[Any, ...]:
+        """Recordings of a kind, in the order of the take."""
+        return tuple(sensor.recording for sensor in self.sensors if sensor.kind.table == table)
 
 
-def _surface_points(entry: SurfacePointsEntry, cameras: TakeCameras) -> SurfacePointVideo:
-    entries = cameras.take.surface_points
-    name = sensor_name("surface_points", entries, entries.index(entry))
-    return read_surface_points(entry.file, name, time_offset=entry.time_offset)
+def _load_sensors(cameras: TakeCameras) -> tuple[TakeSensor, ...]:
+    """The sensors of all kinds of a take.
 
-
-def _trackers(entry: TrackerEntry, cameras: TakeCameras) -> BodyTrackerVideo:
-    entries, T = cameras.take.trackers, entry.T_world_file
-    name = sensor_name("trackers", entries, entries.index(entry))
-    return read_body_trackers(entry.file, entry.points, name, time_offset=entry.time_offset, T_world_file=T)
-
-
-_LOADERS: dict[str, Callable[..., Any]] = {
-    "depth": load_depth, "silhouettes": load_silhouettes, "regions": load_region, "skin": load_skin,
-    "lines": load_lines, "surface_points": _surface_points, "trackers": _trackers,
-}  # fmt: skip
-"""{attribute of a take and of its observations: what reads one entry}, those first whose rates others need."""
+    Raises
+    ------
+    PluginError
+        A kind of another distribution raises an error, or returns no recording of the sensor's name.
+    """
+    out = list[TakeSensor]()
+    for table, entries in cameras.take.sensors.items():
+        kind = kind_of(table)
+        for k, entry in enumerate(entries):
+            name = sensor_name(kind.label or table, entries, k)
+            valid = lambda r, name=name, kind=kind: (
+                isinstance(r, SensorRecording) and (r.sensor == name or kind.sensor is None)
+            )
+            with located(cameras.take.path, title_of(table, entry)):
+                what = f"a SensorRecording of the sensor '{name}'"
+                out.append(TakeSensor(kind, entry, kind.call("read", entry, name, cameras, valid=valid, what=what)))
+    return tuple(out)
 
 
 @checked
@@ -217,19 +217,19 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
             rates[stream] = read.rate
         streams[stream] = times + of_cameras.offset(source.camera)
         keypoints.append((read, streams[stream]))
-    loaded = {
-        kind: read_each(take, getattr(take, kind), partial(load, cameras=of_cameras)) for kind, load in _LOADERS.items()
-    }
-    depth = tuple(video for video in loaded["depth"] if isinstance(video, DepthVideo))
-    clouds = tuple(video for video in loaded.pop("depth") if isinstance(video, CloudVideo))
-    fastest, lines, clicks = of_cameras.fastest, loaded["lines"], load_clicks(of_cameras)
-    recordings: tuple[_Timed, ...] = (*depth, *clouds, *loaded["surface_points"], *loaded["trackers"])
+    deep = read_each(take, take.depth, partial(load_depth, cameras=of_cameras))
+    depth = tuple(video for video in deep if isinstance(video, DepthVideo))
+    clouds = tuple(video for video in deep if isinstance(video, CloudVideo))
+    sensors = _load_sensors(of_cameras)
+    skin = read_each(take, take.skin, partial(load_skin, cameras=of_cameras))
+    fastest, clicks = of_cameras.fastest, load_clicks(of_cameras)
+    recordings: tuple[SensorRecording, ...] = (*depth, *clouds, *(sensor.recording for sensor in sensors))
     marked = [(f"[[markers]] {k}", e.time_offset + m.times) for k, (e, m) in enumerate(zip(take.markers, markers), 1)]
-    if not (streams or lines or clicks or markers or recordings):
+    if not (streams or clicks or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
         raise TakeError("the cameras have no video and no keypoints", file=take.path, remedy=remedy)
     first_time = 0.0
-    own = [*(recording.rate for recording in (*recordings, *lines, *clicks)), *(m.rate for m in markers)]
+    own = [*(recording.rate for recording in (*recordings, *clicks)), *(m.rate for m in markers)]
     rate = fastest or own[0]
     if streams:
         overlap = is_uncalibrated(take) or bool(found)
@@ -245,15 +245,16 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         common, whole = (frames[1] - frames[0]) / rate, max(float(np.ptp(t)) for t in streams.values()) + 1.0 / rate
         if overlap and not take.frames and whole > 1.1 * common:
             notes.append(f"all cameras saw {common:.3g} s, the longest {whole:.3g} s")
-    elif recordings or lines or clicks:
-        frames = take.frames or _span(recordings or lines or clicks, rate)
+    elif recordings or clicks:
+        dense = [recording for recording in recordings if not isinstance(recording, LineVideo)]
+        frames = take.frames or _span(dense or recordings or clicks, rate)
     else:
         first_time = float(min(times[0] for _, times in marked))
         end = max(times[-1] + 1.0 / m.rate for (_, times), m in zip(marked, markers))
         frames, marked = take.frames or (0, round((end - first_time) * rate)), []
-    kinds = {LineVideo: "lines of camera", KeypointVideo: "keypoints of camera", SurfacePointVideo: "surface",
-             BodyTrackerVideo: "trackers"}  # fmt: skip
-    others = [(f"{kinds.get(type(r), 'depth')} {r.sensor}", r.times) for r in (*recordings, *lines, *loaded["skin"])]
+    kinds = {LineVideo: "lines of camera ", KeypointVideo: "keypoints of camera ", DepthVideo: "depth ",
+             CloudVideo: "depth "}  # fmt: skip
+    others = [(f"{kinds.get(type(r), '')}{r.sensor}", r.times) for r in (*recordings, *skin)]
     _check_times([*others, *marked], frames, rate, take)
     notes += [
         f"{place}: {Path(m.source).name} begins at {times[0]:.6g} s of the take, by its own clock and time_offset"
@@ -267,14 +268,14 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         markers=markers,
         keypoints=tuple(_cut(*k, rate, frames, entry) for k, entry in zip(keypoints, take.keypoints)),
         videos={e.name: e.video for e in take.cameras if e.video is not None}, images=images,
-        depth=depth, clouds=clouds, **loaded,
+        depth=depth, clouds=clouds, sensors=sensors, skin=skin,
         clicks=tuple(c for c in clicks if _within(np.rint(c.times * rate), [frames]).any()),
         notes=(*notes, *found, *what_is_assumed(take)),
         first_time=first_time,
     )
 
 
-def _span(recordings: Sequence[_Timed], rate: float) -> tuple[int, int]:
+def _span(recordings: Sequence[SensorRecording], rate: float) -> tuple[int, int]:
     """Steps from the first frame of any recording to the last."""
     first, last = min(r.times[0] for r in recordings), max(r.times[-1] for r in recordings)
     return round(float(first) * rate), round(float(last) * rate) + 1

@@ -23,6 +23,8 @@ from kinefit.errors import ExportError, KinefitError
 from kinefit.frame.results import FrameResult
 from kinefit.motion import Motion
 from kinefit.readers.take.file import Take, read_take
+from kinefit.readers.take.kinds import SensorKind, kinds_of
+from kinefit.sensors.base import Measurement
 from kinefit.tracking.checkpoints.frame_file import FrameFile
 
 try:
@@ -41,14 +43,20 @@ class Checkpoint:
     folder : Path, made where it is not there; files in it that are not of a checkpoint stay as they are
     key : of all that the result depends on, see `key_of`
     restart : forget what an earlier run left
+    kinds : of sensors of the take, whose measurements are stored, too
 
     Attributes
     ----------
+    packages : whose sensors it stores
     rows : Path of the table of the frames done
     """
 
-    def __init__(self, folder: Path, key: str, *, restart: bool = False) -> None:
+    def __init__(
+        self, folder: Path, key: str, *, restart: bool = False, kinds: Sequence[SensorKind] = ()
+    ) -> None:
         self.folder, self._key, self._restart = Path(folder), key, restart
+        self.packages = {"kinefit", *(kind.plugin.package for kind in kinds if kind.plugin is not None)}
+        self._classes = _record_classes(kinds)
         self.rows = self.folder / _ROWS
         self._lock: IO[bytes] | None = None
         self._frames: FrameFile | None = None
@@ -88,7 +96,7 @@ class Checkpoint:
             self._refuse_others(self._lock)
             if self._restart:
                 self.clear()
-            self._frames = FrameFile(self.folder / _FRAMES, self._key)
+            self._frames = FrameFile(self.folder / _FRAMES, self._key, self._classes)
             self._remove_rows()
         except OSError as error:
             self.close()
@@ -167,10 +175,24 @@ class Checkpoint:
                 self.folder.parent.rmdir()  # of results, if there are none
 
 
+def _record_classes(kinds: Iterable[SensorKind]) -> list[type]:
+    """Classes of records of plug-ins: all their measurements, in the order of their names, and what they list."""
+    packages = {kind.plugin.package for kind in kinds if kind.plugin is not None}
+    found, queue = set[type](), list[type]([Measurement])
+    while queue:
+        own: list[type] = queue.pop().__subclasses__()
+        found |= {one for one in own if one.__module__.partition(".")[0] in packages}
+        queue += own
+    listed = {one for kind in kinds for one in kind.records}
+    return sorted(found | listed, key=lambda one: (one.__module__, one.__qualname__))
+
+
 def key_of(take: Take, **options: Any) -> str:
     """Digest of a take, of its files as far as size and time of change tell, of options and of kinefit's own code."""
     digest = hashlib.sha256(repr((take, sorted(options.items()), np.__version__)).encode())
     digest.update(code_digest())
+    for kind in kinds_of(take):
+        digest.update(b"" if kind.plugin is None else kind.plugin.code_digest)
     takes = [take] if take.subject is None else [take, read_take(take.subject)]
     paths = set().union(*(_paths(one) | {Path(one.body)} for one in takes)) - {take.path}
     for path in sorted(paths, key=str):

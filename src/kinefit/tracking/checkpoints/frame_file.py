@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from kinefit._records import RecordFile
+from kinefit._records import Codec, RecordFile
 from kinefit.errors import ExportError, FileError, ObservationError
 from kinefit.sensors.base import Sensor
 from kinefit.sensors.points.keypoints import Layout, Stream
@@ -38,6 +38,7 @@ class FrameFile(Store):
     ----------
     path : Path; what another run left there is overwritten where it is of no use
     key : of all that the result depends on
+    classes : of records, besides those of kinefit
 
     Attributes
     ----------
@@ -48,11 +49,12 @@ class FrameFile(Store):
     problem : what is wrong with what an earlier run left, "" for nothing
     """
 
-    def __init__(self, path: Path, key: str) -> None:
+    def __init__(self, path: Path, key: str, classes: Iterable[type] = ()) -> None:
         head = FORMAT + hashlib.sha256(key.encode()).hexdigest().encode() + b"\n"
         self._file = open(path, "r+b" if path.exists() else "w+b")
         seal = hashlib.sha256(head).digest()
-        super().__init__(records=RecordFile(self._file, seal, start=len(head), name=path))
+        codec = Codec(list(dict.fromkeys([*CODEC.classes, *classes])))
+        super().__init__(records=RecordFile(self._file, seal, start=len(head), name=path), codec=codec)
         self._path, self._known = path, dict[str, Any]()
         self._layout_of: Callable[[Sequence[Stream]], Layout]
         self.at: int | None = None
@@ -83,7 +85,7 @@ class FrameFile(Store):
                 steps += [number] if tag == RESULTS else []
         end, size = records.end, self._path.stat().st_size
         try:
-            self.state = CODEC.decode(last) if last else None
+            self.state = self._codec.decode(last) if last else None
         except FileError:
             whole, last = records.start, b""
         records.cut(whole)
@@ -99,15 +101,30 @@ class FrameFile(Store):
         ------
         ExportError
             It cannot be written.
+        ObservationError
+            A sensor's state has what is neither a number, a text, an array nor a record that is stored.
         """
-        data = CODEC.encode(state)
+        try:
+            data = self._codec.encode(state)
+        except TypeError as error:
+            names = (name for name, (_, learnt) in state["sensors"]["sensors"].items() if not self._can_store(learnt))
+            problem = f"sensor '{next(names, '?')}' has a state that cannot be stored: {error}"
+            remedy = "Keep numbers, texts, arrays and lists of them in `state_attributes`, or leave out the checkpoint."
+            raise ObservationError(problem, remedy=remedy) from error
         try:
             self._records.append(data, _STATE, at)
             self._records.flush()
         except OSError as error:
             raise self._full(error) from error
         self.at = at
-        return CODEC.decode(data)
+        return self._codec.decode(data)
+
+    def _can_store(self, state: Any) -> bool:
+        try:
+            self._codec.encode(state)
+        except TypeError:
+            return False
+        return True
 
     def name(self, **objects: Any) -> None:
         """Names by which records refer to objects that every run has of its own."""
@@ -139,7 +156,8 @@ class FrameFile(Store):
         if isinstance(thing, Layout):
             return _LAYOUT + json.dumps(thing.streams)
         problem = f"a checkpoint cannot store a custom {type(thing).__name__}"
-        raise ObservationError(problem, remedy="Leave out checkpoint.")
+        remedy = "Name its class in `records` of its SensorKind, or leave out checkpoint."
+        raise ObservationError(problem, remedy=remedy)
 
     def _resolve(self, reference: int | str) -> Any:
         if (name := str(reference)).startswith(_LAYOUT):

@@ -1,17 +1,24 @@
-"""Read tables of tracked points: body-worn trackers, and the paths of `kinefit surface`."""
+"""`[[tracker]]`: trackers fixed on the body, such as magnetic ones: poses of segments, or places of points."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from msgspec import field
+from numpy.typing import ArrayLike, NDArray
 
 from kinefit._files import rate_of, read_table, repeated
+from kinefit.bodies import Body
 from kinefit.errors import FileError, ObservationError, choices
 from kinefit.geometry import se3
-from kinefit.observations import BodyTrackerVideo, SurfacePointVideo
+from kinefit.observations import BodyTrackerFrame, SensorRecording
+from kinefit.readers.take.entries import PlacedEntry
+from kinefit.readers.take.kinds import SensorKind
+from kinefit.sensors.points.body_trackers import BodyTrackerSensor
 
 _POSITION_COLUMNS = ("time_s", "x", "y", "z")
 _QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
@@ -19,10 +26,44 @@ _REMEDY = "Give a table with the columns time_s, tracker, x, y, z [s, m] and, fo
 _MAX_NORM_ERROR = 0.5  # of a unit quaternion; rounding changes it by much less
 
 
+class TrackerEntry(PlacedEntry, frozen=True, kw_only=True):
+    """`[[tracker]]`."""
+
+    points: dict[str, str]  # of each tracker of the file: landmark of the body, or segment, whose origin it then is
+    mounts: dict[str, tuple[float, float, float]] = field(default_factory=dict)  # [deg] rotation vector, from a
+    # tracker's axes to its segment's
+    rotation_sigma: float = 2.0  # [deg] standard deviation of an orientation
+    mount_sigma: float = 0.0  # [deg] standard deviation of the mounts, which are then estimated; default: exact
+
+
+@dataclass(frozen=True, eq=False)
+class BodyTrackerRecording(SensorRecording):
+    """Trackers on the body over time.
+
+    Parameters
+    ----------
+    sensor, rate, times : see `SensorRecording`
+    names : (K,) of the trackers
+    x_world : (F, K, 3) [m]; NaN if missing
+    Rs_world_tracker : (F, K, 3, 3); NaN if missing
+    source : file, for messages
+    """
+
+    names: tuple[str, ...]
+    x_world: NDArray
+    Rs_world_tracker: NDArray
+    source: str = ""
+
+    def frame(self, i: int) -> BodyTrackerFrame:
+        """Frame number `i`; a negative number counts from the end."""
+        i, time = self._at(i)
+        return BodyTrackerFrame(self.sensor, time, self.names, self.x_world[i], self.Rs_world_tracker[i])
+
+
 def read_body_trackers(
     path: Path, names: Iterable[str], sensor: str = "trackers", *, time_offset: float = 0.0,
     T_world_file: ArrayLike | None = None,
-) -> BodyTrackerVideo:  # fmt: skip
+) -> BodyTrackerRecording:  # fmt: skip
     """Read named trackers of a table with the columns time_s, tracker, x, y, z [s, m], and optional qw, qx, qy, qz.
 
     Parameters
@@ -64,33 +105,25 @@ def read_body_trackers(
         x[frame[own], k] = se3.apply(T, values[own, 1:4])
         R[frame[own & turned], k] = T[:3, :3] @ se3.rotation_from_quaternion(values[own & turned, 4:])
     rate = rate_of(times, path, _REMEDY)
-    return BodyTrackerVideo(sensor, rate, times + time_offset, names, x, R, source=str(path))
+    return BodyTrackerRecording(sensor, rate, times + time_offset, names, x, R, source=str(path))
 
 
-_SURFACE_COLUMNS = ("time_s", "point", "x", "y", "z", "std_x", "std_y", "std_z")
-_SURFACE_REMEDY = f"Give trajectories.csv of `kinefit surface`, or a table with {', '.join(_SURFACE_COLUMNS)}."
+def _read(entry: TrackerEntry, name: str, _: Any) -> BodyTrackerRecording:
+    T = entry.T_world_file
+    return read_body_trackers(entry.file, entry.points, name, time_offset=entry.time_offset, T_world_file=T)
 
 
-def read_surface_points(path: Path, sensor: str = "surface_points", *, time_offset: float = 0.0) -> SurfacePointVideo:
-    """Points of a table with the columns time_s, point, x, y, z, std_x, std_y, std_z [s, m]; others are not read.
-
-    Raises
-    ------
-    FileError
-        No such table, other columns, or a number that is none, with its line.
-    ObservationError
-        No points, or a single time, of which no rate follows.
-    """
-    values = read_table(path, _SURFACE_COLUMNS, _SURFACE_REMEDY)[1]
-    bad = ~(np.isfinite(values).all(axis=1) & (values[:, 5:] > 0).all(axis=1) & (np.abs(values[:, 1]) < 2**53))
-    if bad.any():
-        problem = "a number that is not finite, or a standard deviation that is not positive"
-        raise FileError(problem, file=path, place=f"line {int(np.argmax(bad)) + 2}", remedy="Remove the row.")
-    times, frame = np.unique(values[:, 0], return_inverse=True)
-    rate = rate_of(times, path, _SURFACE_REMEDY)
-    order = np.argsort(frame, kind="stable")
-    values, first = values[order], np.searchsorted(frame[order], np.arange(len(times) + 1))
-    return SurfacePointVideo(
-        sensor, rate, times + time_offset, first, values[:, 1].astype(np.int64), values[:, 2:5], values[:, 5:],
-        source=str(path),
+def _sensor(entry: TrackerEntry, recording: BodyTrackerRecording, body: Body) -> BodyTrackerSensor:
+    turn, mounts = np.radians(entry.rotation_sigma), {name: np.radians(m) for name, m in entry.mounts.items()}
+    sensor = BodyTrackerSensor(
+        recording.sensor, entry.points, sigma=entry.sigma, rotation_sigma=float(turn), mounts=mounts,
+        mount_sigma=float(np.radians(entry.mount_sigma)),
     )  # fmt: skip
+    sensor.places(body, recording.names)
+    return sensor
+
+
+KIND = SensorKind(
+    table="tracker", summary="trackers fixed on the body: poses of segments, or places of points", label="trackers",
+    entry=TrackerEntry, read=_read, sensor=_sensor, finds_pose=True, replaces_keypoints=True,
+)  # fmt: skip

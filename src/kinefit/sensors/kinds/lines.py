@@ -1,4 +1,4 @@
-"""Image lines of known objects: `[[lines]]`, a table of two image points a line and frame; and clicked joints."""
+"""`[[lines]]`: image lines of known objects, from a table of two image points a line and frame."""
 
 from __future__ import annotations
 
@@ -6,22 +6,38 @@ import csv
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import read_text
-from kinefit.errors import FileError, ObservationError, TakeError, choices
-from kinefit.observations import ClickVideo, LineVideo
-from kinefit.readers.annotations import read_clicks
+from kinefit.errors import FileError, ObservationError, choices
+from kinefit.observations import LineVideo
 from kinefit.readers.take.cameras import TakeCameras, stated_frame, stated_rate
-from kinefit.readers.take.entries import LinesEntry
+from kinefit.readers.take.entries import Pixels, Rate
+from kinefit.readers.take.kinds import SensorKind, TakeEntry, refuse
 
 _COLUMNS = ("frame", "line", "u1", "v1", "u2", "v2")
 _REMEDY = f"Give a table with the columns {', '.join(_COLUMNS)} (.csv), or a list of objects with these keys (.json)."
 
-_CLICK_CROSS_PX = 20.0  # from a click to the ends of the two lines that cross there: short, that no lens bends them
+
+class LinesEntry(TakeEntry, frozen=True, kw_only=True):
+    """`[[lines]]`: image lines in one camera on which points or edges of the body lie."""
+
+    camera: str
+    file: Path  # table of frame, line, u1, v1, u2, v2 [px]
+    landmarks: dict[str, tuple[str, ...]]  # of each line: two ends of an edge of the body, or one point
+    frame: Literal["calibration", "video"] | None = None  # image frame of the lines; needed where the two differ
+    rate: Rate | None = None  # [Hz]; default: the camera's video, or the take
+    sigma: Pixels = 2.0  # [px] standard deviation, in the calibration's image
+
+    def __post_init__(self) -> None:
+        example = 'Write landmarks = { edge = ["r_asis", "l_asis"] }, one entry for each line.'
+        refuse(not self.landmarks, "no landmarks", example)
+        for name, own in self.landmarks.items():
+            odd = not 1 <= len(set(own)) == len(own) <= 2
+            refuse(odd, f"line '{name}' has {len(own)} landmarks", "Give the two ends of an edge, or one point.")
 
 
 def read_lines(path: Path, names: Iterable[str]) -> tuple[NDArray, NDArray]:
@@ -73,48 +89,7 @@ def _rows(path: Path) -> Iterable[tuple[str, Mapping[str, Any]]]:
         raise FileError(f"cannot read the lines ({error})", file=path, remedy=_REMEDY) from error
 
 
-def load_clicks(cameras: TakeCameras) -> tuple[ClickVideo, ...]:
-    """Joints that were clicked: each is two image lines that cross in it, along u and v, with its landmark on both.
-
-    Raises
-    ------
-    TakeError
-        Nothing states the rate; a camera that the take does not have.
-    FileError
-        As `read_clicks`.
-    """
-    take, images, out = cameras.take, cameras.images, list[ClickVideo]()
-    if take.clicks is None:
-        return ()
-    steps = read_clicks(take.clicks)
-    for camera in dict.fromkeys(camera for of in steps for camera in of.points):
-        if camera not in images:
-            problem = choices("camera", camera, images)
-            raise TakeError(problem, file=take.clicks, place="[start] clicks", remedy="Remove its clicks.")
-        rate = stated_rate(cameras.fastest, take.path)
-        mine = [of for of in steps if of.points.get(camera)]
-        names = tuple(dict.fromkeys(name for of in mine for name in of.points[camera]))
-        uv = np.array([[of.points[camera].get(name, (np.nan, np.nan)) for name in names] for of in mine])
-        cross = _CLICK_CROSS_PX * np.array([[[0, -1], [0, 1]], [[-1, 0], [1, 0]]])
-        ends = images[camera].to_calibration(uv[:, :, None, None] + cross).reshape(len(mine), -1, 2, 2)
-        offset = cameras.offset(camera)
-        times = offset + np.array([round(of.step - offset * rate) for of in mine]) / rate
-        titles = tuple(f"{name} {axis}" for name in names for axis in "uv")
-        landmarks = tuple((name,) for name in names for _ in "uv")
-        out.append(ClickVideo(camera, rate, times, titles, landmarks, ends, source=str(take.clicks)))
-    return tuple(out)
-
-
-def load_lines(entry: LinesEntry, cameras: TakeCameras) -> LineVideo:
-    """A `[[lines]]` of a take.
-
-    Raises
-    ------
-    TakeError
-        Nothing states the rate, or the image in which the lines are.
-    KinefitError
-        As `read_lines`.
-    """
+def _read(entry: LinesEntry, _: str, cameras: TakeCameras) -> LineVideo:
     frame = stated_frame(cameras.images[entry.camera], entry.frame, "lines")
     rate, clock = stated_rate(entry.rate or cameras.fastest), cameras.clocks.get(entry.camera)
     names = tuple(entry.landmarks)
@@ -128,3 +103,9 @@ def load_lines(entry: LinesEntry, cameras: TakeCameras) -> LineVideo:
         entry.camera, rate, times, names, tuple(map(tuple, entry.landmarks.values())), ends,
         source=str(entry.file),
     )  # fmt: skip
+
+
+KIND = SensorKind(
+    table="lines", summary="image lines on which points or edges of the body lie", entry=LinesEntry, read=_read,
+    sigma=lambda entry: {f"lines {entry.camera}": entry.sigma}, finds_pose=True, replaces_keypoints=True,
+)  # fmt: skip

@@ -1,31 +1,69 @@
-"""Masks of a take in files, by a video's background, by colour or by detector; colour images; skin by its colour."""
+"""`[[silhouette]]` and `[[region]]`: masks in files, by a background, by colour or by detector; colour images."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from kinefit._pictures import read_picture
 from kinefit.errors import FileError, ObservationError, TakeError
 from kinefit.geometry.camera import ImageFrame
-from kinefit.images.detectors.skin import LANDMARKS, WRISTS, SkinTracker, face_box
 from kinefit.images.silhouette import BackgroundPlate, colour_mask
-from kinefit.observations import ColourVideo, Detections, KeypointVideo, SilhouetteVideo
+from kinefit.observations import ColourVideo, Detections, SilhouetteVideo
 from kinefit.observations.clocks import frame_times
 from kinefit.readers.depth.images import listed
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.take.cameras import TakeCameras, stated_frame, stated_rate
-from kinefit.readers.take.entries import KeypointsEntry, RegionEntry, SilhouetteEntry, Take
+from kinefit.readers.take.entries import Pixels, Rate
+from kinefit.readers.take.kinds import SensorKind, TakeEntry, refuse
 from kinefit.readers.video import Video
 
 _SIDE = 1000  # [px] of an image that its background is taken from: larger ones are made smaller by a whole number
 _LEARNT = 30  # images of a video from which its background is learnt
 _PICTURES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
+_Level = Annotated[int, Meta(ge=0, le=255, description="Give [r, g, b], 0 to 255 each.")]
+
+
+class SilhouetteEntry(TakeEntry, frozen=True, kw_only=True):
+    """`[[silhouette]]`: which pixels of one camera show the person."""
+
+    camera: str
+    file: Path | None = None  # of "masks": folder or pattern; of "background": image of the empty scene
+    format: Literal["masks", "background", "threshold", "detect"] = "masks"
+    frame: Literal["calibration", "video"] | None = None  # image frame of the masks; needed where the two differ
+    rate: Rate | None = None  # [Hz] of the masks; default: the camera's video, or the take
+    sigma: Pixels = 4.0  # [px] standard deviation of an outline, in the calibration's image
+    low: tuple[_Level, _Level, _Level] | None = None  # of "threshold": least value of each channel that is the body's
+    high: tuple[_Level, _Level, _Level] | None = None  # and the largest
+    channels: Literal["rgb", "hsv", "lab", "ycrcb"] | None = None  # of low and high, 8 bits each; default: rgb
+    smooth: Pixels | None = None  # [px] of the Gaussian before the Laplace operator; default: 1
+
+    def __post_init__(self) -> None:
+        self._uses(self.format, {
+            "file": ("masks", "background", "detect"), "frame": ("masks",), "rate": ("masks",),
+            **dict.fromkeys(("low", "high", "channels", "smooth"), ("threshold",)),
+        })  # fmt: skip
+        none = self.file is None and self.format == "masks"
+        refuse(none, "no file of masks", 'Write file = "..." (a folder), or another format.')
+        if self.format == "threshold":
+            remedy = "Write low = [r, g, b] and high = [r, g, b], 0 to 255 each."
+            refuse(self.low is None or self.high is None, "no colour of the body", remedy)
+            odd = any(a > b for a, b in zip(self.low or (), self.high or ()))
+            refuse(odd, f"low = {self.low}, high = {self.high}", "Give 0 to 255, the lower ones first.")
+
+
+class RegionEntry(TakeEntry, frozen=True, kw_only=True):
+    """`[[region]]`: a camera in whose video the body is followed by the colours inside and outside of its contour."""
+
+    camera: str
+    sigma: Pixels | None = None  # [px] standard deviation of the contour, shape included; default: as the body is made
 
 
 def read_silhouettes(
@@ -65,22 +103,6 @@ def read_silhouettes(
 
     times = time_offset + frame_times(len(files), rate, clock)
     return SilhouetteVideo(camera, rate, times, size, image, str(path))
-
-
-def load_silhouettes(entry: SilhouetteEntry, cameras: TakeCameras) -> SilhouetteVideo:
-    """A `[[silhouette]]` of a take, which becomes one of its streams.
-
-    Raises
-    ------
-    TakeError
-        Nothing states the rate, or the image in which masks are.
-    KinefitError
-        As `read_silhouettes`.
-    """
-    found = _silhouettes(entry, cameras)
-    cameras.rates[f"silhouettes {found.sensor}"] = found.rate
-    cameras.streams[f"silhouettes {found.sensor}"] = found.times
-    return found
 
 
 def _silhouettes(entry: SilhouetteEntry, cameras: TakeCameras) -> SilhouetteVideo:
@@ -196,76 +218,30 @@ def in_calibration(mask: NDArray, size: tuple[int, int], frame: ImageFrame | Non
     return np.asarray(cv2.warpAffine(mask, T, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
 
 
-def load_region(entry: RegionEntry, cameras: TakeCameras) -> ColourVideo:
-    """The video of a `[[region]]` of a take, in the calibration's image frame; raises what reading a video raises."""
+def _load_silhouettes(entry: SilhouetteEntry, _: str, cameras: TakeCameras) -> SilhouetteVideo:
+    """A `[[silhouette]]` of a take, which becomes one of its streams."""
+    found = _silhouettes(entry, cameras)
+    cameras.rates[f"silhouettes {found.sensor}"] = found.rate
+    cameras.streams[f"silhouettes {found.sensor}"] = found.times
+    return found
+
+
+def _load_region(entry: RegionEntry, _: str, cameras: TakeCameras) -> ColourVideo:
+    """The video of a `[[region]]` of a take, in the calibration's image frame."""
     video, size, frame = cameras.video(entry.camera), cameras.size(entry.camera), cameras.images[entry.camera]
     image = lambda i: in_calibration(video.read(i), size, frame)
     times = cameras.offset(entry.camera) + video.times
     return ColourVideo(entry.camera, video.rate, times, size, image, str(video.path))
 
 
-_NAMES = {"HANDS": LANDMARKS, "WRISTS": WRISTS}
+SILHOUETTES = SensorKind(
+    table="silhouette", summary="which pixels of a camera show the person", entry=SilhouetteEntry,
+    read=_load_silhouettes, sigma=lambda entry: {f"silhouette {entry.camera}": entry.sigma}, replaces_keypoints=True,
+    shows_everybody=True,
+)  # fmt: skip
 
-
-def load_skin(entry: KeypointsEntry, cameras: TakeCameras) -> KeypointVideo:
-    """A `[[keypoints]]` of a take with format = "skin"; images are read when their frames are asked for.
-
-    Raises
-    ------
-    TakeError
-        Nothing states where the face is.
-    KinefitError
-        What reading the video, and the tracker at a face that is not in it, raise.
-    """
-    take, video, offset = cameras.take, cameras.video(entry.camera), cameras.offset(entry.camera)
-    used = entry.frames or take.frames
-    begin, end = 0, len(video)
-    if used is not None:  # half a step before the first of them, and before the one after the last
-        bounds = (np.array(used) - 0.5) / (cameras.fastest or video.rate) - offset
-        begin, end = (int(k) for k in np.searchsorted(video.times, bounds))
-    if begin >= end:
-        raise TakeError("none of its frames is in the video", remedy=f"The video has {len(video)} frames.")
-    face = entry.face
-    if face is None:
-        begin, face = _detected_face(take, entry, begin, end)
-    seen = _Seen(video, begin, face, cameras.images[entry.camera])
-    times = offset + video.times[begin:end]
-    names = _NAMES[entry.set or "HANDS"]
-    return KeypointVideo(entry.camera, video.rate, times, names, seen.points, source=str(video.path))
-
-
-def _detected_face(
-    take: Take, entry: KeypointsEntry, begin: int, end: int
-) -> tuple[int, tuple[float, float, float, float]]:
-    """The first frame in which the built-in detector saw somebody, and the face there, of which it saw best."""
-    file = detections_file(take.path, entry.camera)
-    if not file.exists():
-        raise TakeError(
-            "the place of the face is not stated",
-            remedy="Write face = [left, top, width, height] of the first image used, or run `kinefit detect`.",
-        )
-    found = read_detections(file)
-    frames = [i for i in range(begin, min(end, len(found))) if found.seen[i].any()]
-    if not frames:
-        raise TakeError("no person is detected", remedy="Write face = [left, top, width, height] of the first one.")
-    people = np.where(found.seen[frames[0]], found.confidence[frames[0]].mean(axis=1), -1.0)
-    return frames[0], face_box(found.points[frames[0], int(np.argmax(people))])
-
-
-class _Seen:
-    """Face and hands in the frames of a video: followed from the first one on, each image once."""
-
-    def __init__(
-        self, video: Video, begin: int, face: tuple[float, float, float, float], image: ImageFrame
-    ) -> None:
-        self._video, self._begin, self._image = video, begin, image
-        self._tracker = SkinTracker(video.read(begin), face, rate=video.rate)
-        self._found: list[tuple[NDArray, NDArray]] = []
-
-    def points(self, i: int) -> tuple[NDArray, NDArray]:
-        """Places (3, 2) [px] in the calibration's image and confidence (3,) in frame `i` after the first."""
-        while len(self._found) <= i:
-            self._tracker.update(self._video.read(self._begin + len(self._found)))
-            frame = self._tracker.frame("", 0.0)
-            self._found.append((self._image.to_calibration(frame.uv), frame.confidence))
-        return self._found[i]
+REGIONS = SensorKind(
+    table="region", summary="a video in which the body is tracked by its colours", entry=RegionEntry,
+    read=_load_region, sigma=lambda entry: {f"region {entry.camera}": entry.sigma} if entry.sigma else {},
+    replaces_keypoints=True, shows_everybody=True,
+)  # fmt: skip
