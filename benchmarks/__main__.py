@@ -1,6 +1,7 @@
-"""All areas one after the other, each in a process of its own: `python -m benchmarks [AREA ...] [--quick]`.
+"""All areas one after the other, each in a process of its own: `python -m benchmarks [AREA ...] [--quick [--brief]]`.
 
-In the quick form, which is no measure of speed, two at a time; what each prints is shown when it has ended. The exit
+In the quick form, which is no measure of speed, two at a time; what each prints is shown when it has ended. With
+`--brief`, too, an area ends after the part that runs after 40 s, and begins with another part each day. The exit
 code is 0 where every area ran to its end; figures that are missed or not measured do not change it.
 """
 

@@ -9,7 +9,8 @@ import shlex
 import sys
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from datetime import date
 from importlib import import_module
 from pathlib import Path
 from typing import TypeVar
@@ -91,11 +92,21 @@ def amount(whole: Amount, few: Amount) -> Amount:
     return few if quick() else whole
 
 
-OPTIONS = "--quick", "--no-peers", "--no-log"
+OPTIONS = "--quick", "--brief", "--no-peers", "--no-log"
+
+BRIEF_S = 40.0
+"""[s] after which an area begins no further part with `--brief`, which also begins with another part each day."""
+
 
 FAILED: list[str] = []
 """Processes of kinefit's own that a part started and that broke off: their figures are not measured, and `run_parts`
 ends with an error."""
+
+
+def turned(parts: Sequence[str]) -> Sequence[str]:
+    """The parts from another one on each day."""
+    first = date.today().toordinal() % len(parts)
+    return [*parts[first:], *parts[:first]]
 
 
 def run_parts(parts: Mapping[str, str]) -> None:
@@ -120,8 +131,11 @@ def run_parts(parts: Mapping[str, str]) -> None:
         from benchmarks.ledger import commit
 
         commit()  # that of the code which is imported now, whatever is edited while the parts run
-    broken = []
-    for name in chosen or parts:
+    broken, start = [], time.monotonic()
+    for name in chosen or (turned(list(parts)) if "--brief" in options else parts):
+        if "--brief" in options and time.monotonic() - start > BRIEF_S:
+            print(f"\n# {name}: not begun, {LEFT_OUT}", flush=True)
+            continue
         print(f"\n# {name}: {parts[name]}", flush=True)
         began, _PART[:] = time.monotonic(), [name]
         try:

