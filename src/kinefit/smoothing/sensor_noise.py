@@ -10,23 +10,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._mapped import room
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure
+from kinefit.correspondences.points import point_rows
 from kinefit.frame.fit import ignores_surface_offsets, rows_of_points
 from kinefit.frame.results import ROOT_PRIOR_STD
 from kinefit.frame.skin import skin_of
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import ChannelResiduals
+from kinefit.sensors.points.markers import MarkerMatched
+from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.smoothing.linearised import OtherSensors, squares_of
-from kinefit.smoothing.spool import Spool
+from kinefit.smoothing.process_noise import SmoothTake
+from kinefit.smoothing.spool import Spool, stretches
 from kinefit.solvers.bundle.border_frames import gram
 from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, product
+from kinefit.solvers.sequence import point_equations
+from kinefit.solvers.trajectory import _kernels_smoothing
 from kinefit.solvers.trajectory.variance_components import VarianceComponents, variance_components
 
 _RIGID_SURFACE_STDS = 1e-6, 1e-6  # [m], [rad] of surface offsets of a body without joints: it is its surface
 _MIN_SURFACE_STD = 1e-4  # [m] of a surface offset, in place of 0
 _LEVERAGE_FRAMES = 40  # of a take, in which the leverage of each channel is computed
+_MATRIX_FRAMES = 100  # whose (n, n) matrices are made at a time: some 2 MB of each
 _STATED_CHANNELS = 5.0  # channels along one axis, without leverage, that a stated systematic error counts as
 
 
@@ -53,6 +61,13 @@ class OtherNoise:
     def pooled(self, f: int, half: int) -> tuple[NDArray, NDArray]:
         """(n, n) information, averaged over `half` (int) frames to either side, and `systematic` (n, n) of a frame."""
         return _square(self.information[max(f - half, 0) : f + half + 1].mean(axis=0)), _square(self.systematic[f])
+
+    def __add__(self, other: OtherNoise) -> OtherNoise:
+        """The noise of both, of different sensors."""
+        return OtherNoise(
+            self.information + other.information, self.systematic + other.systematic,
+            {**self.components, **other.components},
+        )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
         """The variance components in a few numbers, by sensor."""
@@ -154,6 +169,104 @@ def other_noise(
             both = np.concatenate([(np.sqrt(variance[sensor])[..., None] * mean).reshape(-1, mean.shape[2]), shared])
             pushed_by.append(gram(both, both)[upper])
         systematic[f] = np.sum(pushed_by, axis=0)
+    return OtherNoise(information, systematic, found)
+
+
+def noise_of_sensors(
+    take: SmoothTake, matched: Sequence[tuple[Matched, ...]] | None, pixels: Callable[[int], NDArray], *,
+    half: int = 0, surfaces: bool = True,
+) -> OtherNoise | None:  # fmt: skip
+    """Estimate the noise of all sensors but the keypoints, packed markers too; None without such sensors.
+
+    Parameters
+    ----------
+    matched : T lists of matches of `take.others`; None without them
+    pixels, half, surfaces : see `other_noise`
+    """
+    body, roots, angles, markers = take.body, take.roots, take.angles, take.markers
+    of_markers = None if markers is None else marker_information(body, markers, roots, angles)
+
+    def points(f: int) -> NDArray:
+        return pixels(f) if of_markers is None else pixels(f) + _square(of_markers[f])
+
+    others = None
+    if take.others is not None and matched is not None:
+        others = other_noise(body, take.others, matched, roots, angles, points, half=half, surfaces=surfaces)
+    if markers is None or of_markers is None:
+        return others
+
+    def rest(f: int) -> NDArray:
+        return pixels(f) if others is None else pixels(f) + _square(others.information[f])
+
+    found = marker_noise(body, markers, of_markers, roots, angles, rest, half=half)
+    return found if others is None else found + others
+
+
+def marker_information(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> NDArray:
+    """(T, n (n + 1) / 2) information of packed markers at fitted states, the upper triangle of each frame."""
+    upper, tree = np.triu_indices(body.tree.n_dofs), body.tree
+    out = room((len(roots), len(upper[0])))
+    for some in stretches(len(roots), _MATRIX_FRAMES):
+        at, part = (roots[some], angles[some]), markers.part(some)
+        with np.errstate(divide="ignore"):
+            sigma = 1.0 / np.sqrt(part.factors(part.gaps(body, *at)) * part.weight)
+        packed, _, _ = point_equations(body, part.points, part.places, sigma=sigma)(*at)
+        whole = np.zeros((len(packed), tree.n_dofs, tree.n_dofs))
+        _kernels_smoothing.add_packed(packed, tree.chain, tree.depth, whole)
+        out[some] = whole.transpose(0, 2, 1)[:, upper[0], upper[1]]
+    return out
+
+
+def marker_noise(
+    body: Body, markers: PackedMarkers, information: NDArray, roots: NDArray, angles: NDArray,
+    rest: Callable[[int], NDArray], *, half: int = 0,
+) -> OtherNoise:  # fmt: skip
+    """Estimate the noise of packed markers from their residuals at fitted states, as `other_noise` does.
+
+    Parameters
+    ----------
+    information : of `marker_information`
+    roots, angles : (T, 4, 4), (T, D) fitted
+    rest : frame -> (n, n) information of all other sensors, keypoints too
+    half : frames to either side within the correlation time of the motion
+    """
+    T, K, tree = len(roots), len(markers.points), body.tree
+    gaps, weight = room(markers.places.shape), room(markers.stated.shape)
+    for some in stretches(T):
+        part = markers.part(some)
+        gaps[some] = part.gaps(body, roots[some], angles[some])
+        weight[some] = part.factors(gaps[some]) * part.weight
+    absorbed, count = np.zeros((2, K, 3))
+    for f in np.linspace(0, T - 1, min(_LEVERAGE_FRAMES, T)).astype(int):
+        state, x = BodyState(roots[f], angles[f]), np.where(weight[f, :, None] > 0.0, markers.places[f], np.nan)
+        rows = point_rows(body, state, markers.points, x)
+        J, w = design(body, state, rows), weight[f, rows.group]
+        alone = covariance_alone(body, state, _square(information[f]) + rest(f))
+        for sensor in markers.sensors:
+            own = np.isin(rows.group, markers.columns(sensor))
+            at = rows.group[own], np.arange(np.count_nonzero(own)) % 3
+            absorbed[at] += leverages(J[own], w[own, None] * J[own], alone)
+            count[at] += 1
+    found, variance, shared = {}, np.zeros((K, 3)), np.zeros((len(markers.sensors), 3))
+    source, seen = np.zeros(K, np.int64), np.count_nonzero(weight, axis=0)
+    for q, sensor in enumerate(markers.sensors):
+        own = markers.columns(sensor)
+        known = count[own].sum()
+        mean = np.where(count[own] > 0, absorbed[own] / np.maximum(count[own], 1), absorbed[own].sum() / max(known, 1))
+        leverage = mean.mean(axis=1)
+        noise = variance_components(
+            gaps[:, own], markers.times, leverage=leverage, jitter_leverage=leverage / (2 * half + 1)
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            stated = np.where(weight[:, own] > 0.0, 1.0 / markers.stated[:, own], 0.0).sum(axis=0) / seen[own]
+        stated = np.where(seen[own] > 0, stated, np.nanmean(stated) if seen[own].any() else 0.0)
+        found[sensor], shared[q], source[own] = noise, noise.shared[0], q
+        variance[own] = _systematic(noise, leverage, np.repeat(MarkerMatched.lasts * stated[:, None], 3, axis=1), True)
+    systematic = room(information.shape)
+    _kernels_smoothing.mean_push_squares(
+        roots, angles, markers.points.segments, body.points_rest(markers.points), weight, half, variance, source, shared,
+        tree.parents, tree.dof_start, tree.prismatic, tree.axes, tree.rest, tree.dof_parent, tree.last_dof, systematic,
+    )  # fmt: skip
     return OtherNoise(information, systematic, found)
 
 

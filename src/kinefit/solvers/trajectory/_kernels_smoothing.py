@@ -21,17 +21,19 @@ from kinefit.solvers.trajectory._kernels_shared import take_out, without_shift
 
 @jit
 def pixel_equations(
-    roots, angles, owner, rest, cameras, camera, uv, weight, anchor_owner, anchor_rest, anchors, anchor_weight,
-    member, shared, kind, scale, parents, dof_start, prismatic, axes, rest_joints, chain, depth, C, g, cost,
+    roots, angles, owner, rest, cameras, camera, uv, weight, placed_owner, placed_rest, places, place_weight, robust,
+    place_kind, place_scale, member, shared, kind, scale, parents, dof_start, prismatic, axes, rest_joints, chain,
+    depth, C, g, cost,
 ):  # fmt: skip
     """Normal equations C (F, n, m) packed, g (F, n), cost (F,) of all frames at roots (F, 4, 4), angles (F, D).
 
     uv (F, K, 2) [px], weight (F, K) [1/px²] of points owner (K,), rest (K, 3) seen by camera (K,); and points
-    anchor_owner (P,), anchor_rest (P, 3) that should lie at anchors (F, P, 3) [m], anchor_weight (F, P) [1/m²].
+    placed_owner (P,), placed_rest (P, 3) that should lie at places (F, P, 3) [m], place_weight (F, P) [1/m²], of which
+    the first `robust` have a loss place_kind, place_scale, and the others none.
     member (K,) is the group of a point, -1 for none, and shared (G,) [px²] the variance of the group's common shift,
     independent in every frame; see `_kernels_shared`.
     """
-    size = 2 * owner.size + 3 * anchor_owner.size
+    size = 2 * owner.size + 3 * placed_owner.size
     data, segment, group = np.empty((8, size)), np.empty(size, np.int64), np.empty(size, np.int64)
     factor, blocks = np.empty(size), np.empty((parents.size, 27))
     frames, screws = np.empty((parents.size, 12)), np.empty((axes.shape[0], 6))
@@ -43,12 +45,16 @@ def pixel_equations(
         of_shifts = 0.0
         if shared.size > 0:
             of_shifts = without_shift(data, group, count, weight[t], member, shared, kind, scale, shift, information)
+        of_shifts += weigh(data, group, count, kind, scale, factor)
         count = point_rows(
-            frames, anchor_owner, anchor_rest, anchors[t], anchor_weight[t], data, segment, group, count
+            frames, placed_owner, placed_rest, places[t], place_weight[t], data, segment, group, count
         )  # fmt: skip
         for i in range(first, count):
-            group[i] = -1  # a contact is never an outlier
-        cost[t] = of_shifts + weigh(data, group, count, kind, scale, factor)
+            if group[i] >= robust:
+                group[i] = -1
+        cost[t] = of_shifts + weigh(
+            data[:, first:], group[first:], count - first, place_kind, place_scale, factor[first:]
+        )  # fmt: skip
         blocks[:] = 0.0
         accumulate(data, segment, factor, count, roots[t, 0, 3], roots[t, 1, 3], roots[t, 2, 3], blocks)
         if shared.size > 0:
@@ -200,3 +206,81 @@ def pixel_variance(
                         part += line[index[j]] * row[c, j]
                     total += part * row[c, i]
                 out[t, k, c] = total
+
+
+@jit
+def add_square(s, factor, index, n, out):
+    """Add factor · s sᵀ to an upper triangle (n (n + 1) / 2,), of the degrees of freedom `index` in any order."""
+    for p in range(index.size):
+        for q in range(p + 1):
+            i, j = min(index[p], index[q]), max(index[p], index[q])
+            out[i * n - i * (i - 1) // 2 + j - i] += factor * s[index[p]] * s[index[q]]
+
+
+@jit
+def mean_push_squares(
+    roots, angles, owner, rest, weight, half, variance, source, shared,
+    parents, dof_start, prismatic, axes, rest_joints, dof_parent, last_dof, out,
+):  # fmt: skip
+    """Σ s sᵀ of gradients s of every frame by errors of points that last longer than a window of frames.
+
+    The gradient by an error of point k along axis a is the mean over `half` frames to either side of weight (T, K)
+    [1/m²] times the derivatives of the point's place. variance (K, 3) [m²] is that of each point's own error, and
+    shared (Q, 3) [m] the standard deviation of the error that all points of a source (K,) share.
+    out (T, n (n + 1) / 2) contains the upper triangles.
+    """
+    T, K = weight.shape
+    n = axes.shape[0] + 6
+    frames, screws = np.empty((parents.size, 12)), np.empty((axes.shape[0], 6))
+    total, common, index = np.zeros((K, 3, n)), np.empty((3, n)), np.empty(n, np.int64)
+    for last in range(T + half):
+        for side in range(2):
+            t, sign = (last, 1.0) if side == 0 else (last - 2 * half - 1, -1.0)
+            if t < 0 or t >= T:
+                continue
+            forward(parents, dof_start, prismatic, axes, rest_joints, roots[t], angles[t], frames, screws)
+            for k in range(K):
+                w = sign * weight[t, k]
+                if w == 0.0:
+                    continue
+                x, y, z = place(frames, owner, rest, k)
+                x, y, z = x - roots[t, 0, 3], y - roots[t, 1, 3], z - roots[t, 2, 3]
+                for a in range(3):
+                    total[k, a, a] += w
+                total[k, 0, 4] += w * z
+                total[k, 0, 5] -= w * y
+                total[k, 1, 3] -= w * z
+                total[k, 1, 5] += w * x
+                total[k, 2, 3] += w * y
+                total[k, 2, 4] -= w * x
+                d = last_dof[owner[k]]
+                while d >= 6:
+                    s = screws[d - 6]
+                    total[k, 0, d] += w * (s[0] + z * s[4] - y * s[5])
+                    total[k, 1, d] += w * (s[1] + x * s[5] - z * s[3])
+                    total[k, 2, d] += w * (s[2] + y * s[3] - x * s[4])
+                    d = dof_parent[d]
+        if last < half:
+            continue
+        t = last - half
+        share = 1.0 / (min(last + 1, T) - max(last - 2 * half, 0)) ** 2
+        out[t] = 0.0
+        for k in range(K):
+            for i in range(6):
+                index[i] = i
+            count, d = 6, last_dof[owner[k]]
+            while d >= 6:
+                index[count] = d
+                count, d = count + 1, dof_parent[d]
+            for a in range(3):
+                add_square(total[k, a], share * variance[k, a], index[:count], n, out[t])
+        for i in range(n):
+            index[i] = i
+        for q in range(shared.shape[0]):
+            common[:] = 0.0
+            for k in range(K):
+                if source[k] == q:
+                    common += total[k]
+            for a in range(3):
+                if shared[q, a] > 0.0:
+                    add_square(common[a], share * shared[q, a] ** 2, index, n, out[t])
