@@ -29,6 +29,7 @@ from kinefit.solvers.bundle.border_frames import gram
 from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, product
 from kinefit.solvers.sequence import point_equations
 from kinefit.solvers.trajectory import _kernels_smoothing
+from kinefit.solvers.trajectory.smoothing import unpacked
 from kinefit.solvers.trajectory.variance_components import VarianceComponents, variance_components
 
 _RIGID_SURFACE_STDS = 1e-6, 1e-6  # [m], [rad] of surface offsets of a body without joints: it is its surface
@@ -204,17 +205,21 @@ def noise_of_sensors(
 
 def marker_information(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> NDArray:
     """(T, n (n + 1) / 2) information of packed markers at fitted states, the upper triangle of each frame."""
-    upper, tree = np.triu_indices(body.tree.n_dofs), body.tree
+    upper = np.triu_indices(body.tree.n_dofs)
     out = room((len(roots), len(upper[0])))
     for some in stretches(len(roots), _MATRIX_FRAMES):
-        at, part = (roots[some], angles[some]), markers.part(some)
-        with np.errstate(divide="ignore"):
-            sigma = 1.0 / np.sqrt(part.factors(part.gaps(body, *at)) * part.weight)
-        packed, _, _ = point_equations(body, part.points, part.places, sigma=sigma)(*at)
-        whole = np.zeros((len(packed), tree.n_dofs, tree.n_dofs))
-        _kernels_smoothing.add_packed(packed, tree.chain, tree.depth, whole)
-        out[some] = whole.transpose(0, 2, 1)[:, upper[0], upper[1]]
+        whole = marker_matrices(body, markers.part(some), roots[some], angles[some])
+        out[some] = whole[:, upper[0], upper[1]]
     return out
+
+
+def marker_matrices(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> NDArray:
+    """(T, n, n) information of packed markers at fitted states."""
+    tree = body.tree
+    with np.errstate(divide="ignore"):
+        sigma = 1.0 / np.sqrt(markers.factors(markers.gaps(body, roots, angles)) * markers.weight)
+    packed, _, _ = point_equations(body, markers.points, markers.places, sigma=sigma)(roots, angles)
+    return unpacked(packed, tree)
 
 
 def marker_noise(

@@ -13,7 +13,7 @@ from kinefit._mapped import release
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences.closures import hard_equations, looped
 from kinefit.findings import runs_of
-from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult, frame_result
+from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult, frame_result, frame_results
 from kinefit.frame.trust import unknown_joints
 from kinefit.sensors.base import Matched, pixels_of
 from kinefit.sensors.evidence import moves_points, near
@@ -29,8 +29,7 @@ from kinefit.smoothing.unwrap import unwrap
 from kinefit.smoothing.windows import parts, solved, solved_with_covariances
 from kinefit.solvers.closed import Constraint, on_null_space, onto
 from kinefit.solvers.equations import variances
-from kinefit.solvers.trajectory import _kernels_smoothing
-from kinefit.solvers.trajectory.seen_points import SeenPoints
+from kinefit.solvers.trajectory.smoothing import unpacked
 
 _MATRIX_FRAMES = 100  # whose (n, n) matrices are made at a time: some 2 MB of each
 _NOISE_PARTS = 6  # of a long take, from which its process noise is estimated
@@ -80,7 +79,7 @@ def smooth_results(
     windows : number of frames that are solved at a time, and that two neighbouring windows share
     """
     take = replace(_take(as_tracked(body, frames, settings), settings), one_view=eye is not None)
-    channels, swapped, others = take.channels, take.swapped, take.others
+    channels, swapped = take.channels, take.swapped
     strength, take, rounds = _estimate(take, settings, *windows)
     take, covariances, others_matched = solved_with_covariances(take, strength, *windows)
     new_swaps = _swaps(take)
@@ -100,31 +99,59 @@ def smooth_results(
     for some in stretches(len(fit_weight)):
         fit_weight[some] *= take.confidence[some] / np.square(strength.sigma)
     release(fit_weight, take.confidence)
-    surfaces = False
-    smoothed, packed = Spool[FrameResult](), np.triu_indices(body.tree.n_dofs)
-    covariance = np.empty((body.tree.n_dofs,) * 2)
-    for f, result in enumerate(frames.results):
-        state, weight = BodyState(take.roots[f], take.angles[f]), take.confidence[f] / np.square(channels.sigma)
-        scene = frames.scene_of(state, result.time) if others is None else others.scene(f, take.roots, take.angles)
-        pixels = tuple(
-            replace(
-                m, uv=np.where(weight[:, None] > 0, take.uv[f], np.nan), weight=weight, swapped=swapped[f],
-                beside=m.measurement.layout.beside(scene),
-            )
-            for m in pixels_of(result.matched)
-        )  # fmt: skip
-        more = () if others_matched is None else others_matched[f]
-        markers = () if take.markers is None else take.markers.matched(f, scene)
-        covariance[packed] = covariance.T[packed] = covariances[f]
-        if hard is not None:
-            covariance = on_null_space(covariance, hard(state)[1])
-        frame = frame_result(scene, covariance, (*pixels, *markers, *more), result.iterations, observed=take.observed[f])
-        surfaces |= any(m.shows_surface for m in more)
-        smoothed.append(replace(frame, matched=pixels, measurements=()))
-    if surfaces:
-        smoothed = _with_unknown_joints(body, smoothed, round(_UNKNOWN_TIME * frames.rate))
+    smoothed = _results(take, frames, covariances, others_matched, hard)
     shared = SharedErrors.of(channels, strength.shared, strength.sigma)
     return SmoothedTake(smoothed, take, others_matched, fit_weight, _provenance(take, strength, rounds), shared)
+
+
+def _results(
+    take: SmoothTake, frames: TrackedFrames, covariances: Sequence[NDArray],
+    others: Sequence[tuple[Matched, ...]] | None, hard: Constraint | None,
+) -> Spool[FrameResult]:  # fmt: skip
+    """The frames of a solved take, with the matches of keypoints alone; `others` are the matches of all others."""
+    body, markers = take.body, take.markers
+    out, surfaces, packed = Spool[FrameResult](), False, np.triu_indices(body.tree.n_dofs)
+    for some in stretches(len(take.roots), _MATRIX_FRAMES):
+        several = range(*some.indices(len(take.roots)))
+        covariance = np.empty((len(several), body.tree.n_dofs, body.tree.n_dofs))
+        for own, f in zip(covariance, several):
+            own[packed] = own.T[packed] = covariances[f]
+            if hard is not None:
+                own[:] = on_null_space(own, hard(BodyState(take.roots[f], take.angles[f]))[1])
+        tracked = [frames.results[f] for f in several]
+        if markers is not None and others is None and not len(take.channels.column):
+            part = markers.part(some)
+            at = take.roots[some], take.angles[some]
+            made = frame_results(
+                body, *at, frames.times[some], covariance, part.evidence(body, part.gaps(body, *at)),
+                observed=take.observed[some], iterations=[r.iterations for r in tracked],
+            )  # fmt: skip
+        else:
+            made = [_result(take, frames, f, r, own, others) for f, r, own in zip(several, tracked, covariance)]
+            surfaces |= any(m.shows_surface for f in several for m in (() if others is None else others[f]))
+        for result in made:
+            out.append(result)
+    return _with_unknown_joints(body, out, round(_UNKNOWN_TIME * frames.rate)) if surfaces else out
+
+
+def _result(
+    take: SmoothTake, frames: TrackedFrames, f: int, tracked: FrameResult, covariance: NDArray,
+    others: Sequence[tuple[Matched, ...]] | None,
+) -> FrameResult:  # fmt: skip
+    """Frame f of a solved take, from what the tracker found in it."""
+    state, weight = BodyState(take.roots[f], take.angles[f]), take.confidence[f] / np.square(take.channels.sigma)
+    scene = frames.scene_of(state, tracked.time) if take.others is None else take.others.scene(f, take.roots, take.angles)
+    pixels = tuple(
+        replace(
+            m, uv=np.where(weight[:, None] > 0, take.uv[f], np.nan), weight=weight, swapped=take.swapped[f],
+            beside=m.measurement.layout.beside(scene),
+        )
+        for m in pixels_of(tracked.matched)
+    )  # fmt: skip
+    markers = () if take.markers is None else take.markers.matched(f, scene)
+    matched = (*pixels, *markers, *(() if others is None else others[f]))
+    frame = frame_result(scene, covariance, matched, tracked.iterations, observed=take.observed[f])
+    return replace(frame, matched=pixels, measurements=())
 
 
 def _closed(take: SmoothTake, hard: Constraint) -> SmoothTake:
@@ -193,9 +220,10 @@ def _observed(take: SmoothTake) -> tuple[list[NDArray], NDArray]:
     for some in stretches(T, _MATRIX_FRAMES):
         part = take.part(some)
         points = part.solver_points(take.channels.sigma)
-        found = [_matrices(part, points)]
+        kinds = [points]
         if take.markers is not None or take.others is not None:
-            found.append(_matrices(part, replace(points, weight=np.zeros_like(points.weight))))
+            kinds.append(replace(points, weight=np.zeros_like(points.weight)))
+        found = [unpacked(of.equations(take.body)(part.roots, part.angles)[0], tree) for of in kinds]
         if part.markers is not None:
             gaps = part.markers.gaps(part.body, part.roots, part.angles)
             rows[some] += 3 * np.count_nonzero(part.markers.factors(gaps) > MIN_INLIER_FACTOR, axis=1)
@@ -206,15 +234,6 @@ def _observed(take: SmoothTake) -> tuple[list[NDArray], NDArray]:
             variance = np.array([variances(H + prior)[6:] for H in matrices])
             observed[some] = variance <= np.square(UNOBSERVED_STD_RATIO * tree.spread)
     return out, rows
-
-
-def _matrices(take: SmoothTake, points: SeenPoints) -> NDArray:
-    """(F, n, n) normal matrices of points at the take's states."""
-    tree = take.body.tree
-    packed, _, _ = points.equations(take.body)(take.roots, take.angles)
-    out = np.zeros((len(packed), tree.n_dofs, tree.n_dofs))
-    _kernels_smoothing.add_packed(packed, tree.chain, tree.depth, out)
-    return out + np.tril(out, -1).transpose(0, 2, 1)
 
 
 def _estimate(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ class TrackedFrames:
     times : (F,) [s]
     rate : float [Hz]
     scene_of, apart : of the tracker, see `lag_frame.TrackerLike`
+    markers : labelled markers, if these are the only sensor and all frames were fitted as one sequence
     """
 
     results: Sequence[FrameResult]
@@ -41,6 +42,7 @@ class TrackedFrames:
     rate: float
     scene_of: SceneOf
     apart: ApartRows
+    markers: PackedMarkers | None = field(default=None, kw_only=True)
 
     def pixels(self) -> tuple[Channels, NDArray]:
         """Keypoints of all frames as measured, and (F, N) bool: channels whose left and right the tracker swapped."""
@@ -69,6 +71,8 @@ class TrackedFrames:
 
         Joints that move with morphs need rows: there are then no packed markers.
         """
+        if self.markers is not None:
+            return self.markers, ()
         markers = None
         if len(self.results) and self.scene_of(self.results[0].state, 0.0).morphing is None:
             markers = PackedMarkers.of(body, self.measurements, self.times, settings.marker_loss)

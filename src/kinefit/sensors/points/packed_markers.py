@@ -15,7 +15,8 @@ from kinefit.losses import Loss
 from kinefit.motion import Residuals
 from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.channels import joined
-from kinefit.sensors.points.markers import MarkerMeasurement, MarkerSensor, markers_of
+from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.points.markers import MarkerMeasurement, MarkerSensor, markers_of, of_points
 from kinefit.sensors.scene import Scene
 
 _MAX_TIME_GAP_S = 1e-6  # of a marker from its frame; with a larger gap the body is moved, which only rows can do
@@ -129,6 +130,10 @@ class PackedMarkers:
         """(T, K) robust factors of `gaps` (T, K, 3); 0 where unobserved."""
         squares = self.squares(gaps)
         return np.where(np.isfinite(squares), self.loss.factor(np.nan_to_num(squares)), 0.0)
+
+    def evidence(self, body: Body, gaps: NDArray) -> Evidence:
+        """Evidence of T frames from `gaps` (T, K, 3): that of all sensors, as `MarkerMatched.evidence` has it."""
+        return of_points(body, self.points, self.squares(gaps))
 
     def residuals(self, body: Body, roots: NDArray, angles: NDArray) -> dict[str, Residuals]:
         """Residuals at states (T, 4, 4), (T, D), by sensor."""

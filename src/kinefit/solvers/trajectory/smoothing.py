@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body
+from kinefit.bodies import Body, KinematicTree
 from kinefit.errors import ObservationError
 from kinefit.solvers._kernels_linear import LEAST_DAMPING, adapt
 from kinefit.solvers.equations import dense_pattern
@@ -166,11 +166,16 @@ def smooth(
 def _made_dense(body: Body, equations: MakeEquations) -> MakeEquations:
     def dense(roots: NDArray, angles: NDArray) -> Equations:
         packed, g, cost = equations(roots, angles)
-        C = np.zeros((*g.shape, g.shape[1]))
-        _kernels_smoothing.add_packed(packed, body.tree.chain, body.tree.depth, C)
-        return C, g, cost
+        return unpacked(packed, body.tree), g, cost
 
     return dense
+
+
+def unpacked(packed: NDArray, tree: KinematicTree) -> NDArray:
+    """Symmetric (T, n, n) of matrices (T, n, m) that are packed along the tree."""
+    out = np.zeros((*packed.shape[:2], tree.n_dofs))
+    _kernels_smoothing.add_packed(packed, tree.chain, tree.depth, out)
+    return out + np.tril(out, -1).transpose(0, 2, 1)
 
 
 def _workspace(T: int, n: int) -> tuple[NDArray, NDArray, NDArray]:
