@@ -252,12 +252,18 @@ def _roughly(strength: Strength, take: SmoothTake) -> tuple[Smoothed, Posterior]
 
 
 def estimate_liveliness(take: SmoothTake, strength: Strength, rounds: int = 3) -> SmoothTake:
-    """The take with its liveliness estimated, for a known strength; its states are those of the last round."""
+    """The take with its liveliness estimated, for a known strength; its states are those of the last round.
+
+    `rounds` is the most; they end when no liveliness changes by more than a twentieth.
+    """
     for _ in range(rounds):
         take = take.renewed()
         fit, post = _roughly(strength, take)
         live = _liveliness(take.body, take.dt, *_changes(take, fit, post))
+        change = float(np.abs(np.log(live / take.live)).max())
         take = replace(take, roots=fit.roots, angles=fit.angles, live=live)
+        if change < _MAX_RELATIVE_CHANGE:
+            break
     return take
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._mapped import release
+from kinefit._threads import side_by_side
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences.closures import hard_equations, looped
 from kinefit.findings import runs_of
@@ -247,8 +249,11 @@ def _estimate(
     done = dict(zip(chosen.tolist(), pieces, strict=True))
     take = take.scaled(pieces[0].scale)
     roots, angles, live = np.array(take.roots), np.array(take.angles), np.array(take.live)
+    left = (take.part(whole) for i, whole in enumerate(windows) if i not in done)
+    lively = partial(estimate_liveliness, strength=strength)
+    found = map(lively, left) if take.others is not None else side_by_side(lively, left)
     for i, (whole, kept) in enumerate(parts(len(take.roots), window, overlap)):
-        piece = done[i] if i in done else estimate_liveliness(take.part(whole), strength)
+        piece = done[i] if i in done else next(found)
         release(take.uv, take.confidence)
         inside = slice(kept.start - whole.start, kept.stop - whole.start)
         roots[kept], angles[kept], live[kept] = piece.roots[inside], piece.angles[inside], piece.live[inside]

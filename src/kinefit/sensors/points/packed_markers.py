@@ -53,34 +53,36 @@ class PackedMarkers:
         cls, body: Body, measurements: Sequence[Sequence[Measurement]], times: NDArray, loss: Loss
     ) -> PackedMarkers | None:
         """Markers of T frames with this loss, measured at the frames' times (T,) [s]; None if there are none."""
-        found: dict[tuple[str, str], tuple[MarkerSensor, dict[str, None]]] = {}
-        apart = set[str]()
-        for time, several in zip(times, measurements, strict=True):
-            for m in several:
-                if isinstance(m, MarkerMeasurement):
-                    _, names = found.setdefault((m.sensor, m.marker_set), (m.of, {}))
-                    names.update(dict.fromkeys(m.names))
-                    if abs(m.time - time) > _MAX_TIME_GAP_S or m.of.loss != loss:
-                        apart.add(m.sensor)
-        column: dict[tuple[str, str, str], int] = {}
-        parts, streams, source = list[PointSet](), list[tuple[MarkerSensor, str]](), list[int]()
-        for (name, marker_set), (sensor, names) in found.items():
-            if name not in apart and names:
-                column.update({(name, marker_set, one): len(source) + i for i, one in enumerate(names)})
-                source += [len(streams)] * len(names)
-                streams.append((sensor, marker_set))
-                parts.append(markers_of(body, marker_set).select(tuple(names)))
-        if not streams:
-            return None
-        places, stated = room((len(times), len(source), 3)), room((len(times), len(source)))
+        streams, apart = dict[tuple[str, str], MarkerSensor](), set[str]()
+        column, columns = dict[tuple[str, str, str], int](), dict[tuple[str, str, tuple[str, ...]], list[int]]()
+        places, stated = room((len(times), 0, 3)), room((len(times), 0))
         for f, several in enumerate(measurements):
             for m in several:
-                if isinstance(m, MarkerMeasurement) and m.sensor not in apart:
-                    own = [column[m.sensor, m.marker_set, name] for name in m.names]
-                    places[f, own], stated[f, own] = m.x_world, m.weight
-        release(places, stated)
-        scale = {sensor.name: 1.0 for sensor, _ in streams}
-        return cls(tuple(streams), np.array(source), joined(parts), places, stated, times, loss, scale)
+                if not isinstance(m, MarkerMeasurement):
+                    continue
+                if abs(m.time - times[f]) > _MAX_TIME_GAP_S or m.of.loss != loss:
+                    apart.add(m.sensor)
+                key = m.sensor, m.marker_set
+                own = columns.get((*key, m.names))
+                if own is None:
+                    streams.setdefault(key, m.of)
+                    own = columns[*key, m.names] = [column.setdefault((*key, n), len(column)) for n in m.names]
+                    places, stated = _wider(places, len(column)), _wider(stated, len(column))
+                places[f, own], stated[f, own] = m.x_world, m.weight
+            if f % _STRETCH == 0:
+                release(places, stated)
+        used = [k for k, (name, _, _) in enumerate(column) if name not in apart]
+        if not used:
+            return None
+        if len(used) < len(column):
+            places, stated = places[:, used], stated[:, used]
+        kept = [key for key in streams if key[0] not in apart]
+        of = [(kept.index((name, marker_set)), one) for name, marker_set, one in column if name not in apart]
+        points = joined([markers_of(body, kept[q][1]).select((one,)) for q, one in of])
+        scale = {name: 1.0 for name, _ in kept}
+        source = np.array([q for q, _ in of])
+        found = tuple((streams[key], key[1]) for key in kept)
+        return cls(found, source, points, places, stated, times, loss, scale)
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -153,3 +155,12 @@ class PackedMarkers:
                 "m", measured[:, own], np.zeros(len(values), bool),
             )  # fmt: skip
         return out
+
+
+def _wider(array: NDArray, count: int) -> NDArray:
+    """An array (T, K, ...) with so many columns; new ones are 0."""
+    if array.shape[1] == count:
+        return array
+    out = room((len(array), count, *array.shape[2:]))
+    out[:, : array.shape[1]] = array
+    return out
