@@ -134,10 +134,8 @@ class SmoothTake:
 
     def scaled(self, scale: Mapping[str, float]) -> SmoothTake:
         """The take with other factors {sensor: number from 1}."""
-        markers, others = (
-            block and replace(block, scale={name: scale.get(name, value) for name, value in block.scale.items()})
-            for block in (self.markers, self.others)
-        )  # fmt: skip
+        markers = self.markers and replace(self.markers, scale=_known(self.markers.scale, scale))
+        others = self.others and replace(self.others, scale=_known(self.others.scale, scale))
         return replace(self, markers=markers, others=others)
 
     def fitted(self, roots: NDArray, angles: NDArray) -> NDArray:
@@ -299,6 +297,10 @@ def sensor_scales(takes: list[SmoothTake]) -> dict[str, float]:
         name: float(np.sqrt(max(np.median(s) / _MEDIAN_SQUARE_1D, 1.0))) if len(s) >= _MIN_ROWS else 1.0
         for name, s in inliers.items()
     }
+
+
+def _known(old: Mapping[str, float], new: Mapping[str, float]) -> dict[str, float]:
+    return {name: new.get(name, value) for name, value in old.items()}
 
 
 def _largest_change(old: dict[str, float], new: dict[str, float]) -> float:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from kinefit._mapped import room
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure
-from kinefit.correspondences.points import point_rows
 from kinefit.frame.fit import ignores_surface_offsets, rows_of_points
 from kinefit.frame.results import ROOT_PRIOR_STD
 from kinefit.frame.skin import skin_of
@@ -26,9 +25,8 @@ from kinefit.smoothing.linearised import OtherSensors, squares_of
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.spool import Spool, stretches
 from kinefit.solvers.bundle.border_frames import gram
-from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, product
-from kinefit.solvers.sequence import point_equations
-from kinefit.solvers.trajectory import _kernels_smoothing
+from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, point_derivatives, product
+from kinefit.solvers.trajectory.seen_points import SeenPoints
 from kinefit.solvers.trajectory.smoothing import unpacked
 from kinefit.solvers.trajectory.variance_components import VarianceComponents, variance_components
 
@@ -215,11 +213,9 @@ def marker_information(body: Body, markers: PackedMarkers, roots: NDArray, angle
 
 def marker_matrices(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> NDArray:
     """(T, n, n) information of packed markers at fitted states."""
-    tree = body.tree
-    with np.errstate(divide="ignore"):
-        sigma = 1.0 / np.sqrt(markers.factors(markers.gaps(body, roots, angles)) * markers.weight)
-    packed, _, _ = point_equations(body, markers.points, markers.places, sigma=sigma)(roots, angles)
-    return unpacked(packed, tree)
+    weight = markers.factors(markers.gaps(body, roots, angles)) * markers.weight
+    packed, _, _ = SeenPoints.in_metres(markers.points, markers.places, weight).equations(body)(roots, angles)
+    return unpacked(packed, body.tree)
 
 
 def marker_noise(
@@ -235,44 +231,55 @@ def marker_noise(
     rest : frame -> (n, n) information of all other sensors, keypoints too
     half : frames to either side within the correlation time of the motion
     """
-    T, K, tree = len(roots), len(markers.points), body.tree
+    T, K = len(roots), len(markers.points)
     gaps, weight = room(markers.places.shape), room(markers.stated.shape)
     for some in stretches(T):
         part = markers.part(some)
         gaps[some] = part.gaps(body, roots[some], angles[some])
         weight[some] = part.factors(gaps[some]) * part.weight
-    absorbed, count = np.zeros((2, K, 3))
+    absorbed, count = np.zeros(K), np.zeros(K)
     for f in np.linspace(0, T - 1, min(_LEVERAGE_FRAMES, T)).astype(int):
-        state, x = BodyState(roots[f], angles[f]), np.where(weight[f, :, None] > 0.0, markers.places[f], np.nan)
-        rows = point_rows(body, state, markers.points, x)
-        J, w = design(body, state, rows), weight[f, rows.group]
+        state = BodyState(roots[f], angles[f])
+        J = point_derivatives(body, state, markers.points)
         alone = covariance_alone(body, state, _square(information[f]) + rest(f))
         for sensor in markers.sensors:
-            own = np.isin(rows.group, markers.columns(sensor))
-            at = rows.group[own], np.arange(np.count_nonzero(own)) % 3
-            absorbed[at] += leverages(J[own], w[own, None] * J[own], alone)
-            count[at] += 1
-    found, variance, shared = {}, np.zeros((K, 3)), np.zeros((len(markers.sensors), 3))
-    source, seen = np.zeros(K, np.int64), np.count_nonzero(weight, axis=0)
+            own = markers.columns(sensor)
+            own = own[weight[f, own] > 0.0]
+            lines, w = J[own].reshape(3 * len(own), -1), np.repeat(weight[f, own], 3)[:, None]
+            absorbed[own] += leverages(lines, w * lines, alone).reshape(-1, 3).mean(axis=1)
+            count[own] += 1
+    found, variance, shared = {}, np.zeros((K, 3)), np.zeros((len(markers.sensors), 3, K))
     for q, sensor in enumerate(markers.sensors):
         own = markers.columns(sensor)
-        known = count[own].sum()
-        mean = np.where(count[own] > 0, absorbed[own] / np.maximum(count[own], 1), absorbed[own].sum() / max(known, 1))
-        leverage = mean.mean(axis=1)
+        leverage = filled(absorbed[own], count[own])
         noise = variance_components(
             gaps[:, own], markers.times, leverage=leverage, jitter_leverage=leverage / (2 * half + 1)
         )
-        with np.errstate(divide="ignore", invalid="ignore"):
-            stated = np.where(weight[:, own] > 0.0, 1.0 / markers.stated[:, own], 0.0).sum(axis=0) / seen[own]
-        stated = np.where(seen[own] > 0, stated, np.nanmean(stated) if seen[own].any() else 0.0)
-        found[sensor], shared[q], source[own] = noise, noise.shared[0], q
-        variance[own] = _systematic(noise, leverage, np.repeat(MarkerMatched.lasts * stated[:, None], 3, axis=1), True)
-    systematic = room(information.shape)
-    _kernels_smoothing.mean_push_squares(
-        roots, angles, markers.points.segments, body.points_rest(markers.points), weight, half, variance, source, shared,
-        tree.parents, tree.dof_start, tree.prismatic, tree.axes, tree.rest, tree.dof_parent, tree.last_dof, systematic,
-    )  # fmt: skip
+        seen = weight[:, own] > 0.0
+        stated = np.where(seen, 1.0 / np.where(seen, markers.stated[:, own], 1.0), 0.0)
+        stated = MarkerMatched.lasts * filled(stated.sum(axis=0), np.count_nonzero(seen, axis=0))
+        found[sensor], shared[q][:, own] = noise, noise.shared[0][:, None]
+        variance[own] = _systematic(noise, leverage, np.repeat(stated[:, None], 3, axis=1), MarkerMatched.independent)
+    systematic, upper = room(information.shape), np.triu_indices(body.tree.n_dofs)
+    for some in stretches(T, _MATRIX_FRAMES):
+        frames = np.arange(some.start, some.stop)
+        first, stop = np.maximum(frames - half, 0), np.minimum(frames + half + 1, T)
+        pushes = np.zeros((stop[-1] - first[0] + 1, K, 3, body.tree.n_dofs))
+        for f in range(first[0], stop[-1]):
+            pushes[f - first[0] + 1] = weight[f, :, None, None] * point_derivatives(
+                body, BodyState(roots[f], angles[f]), markers.points
+            )
+        total = np.cumsum(pushes, axis=0)
+        mean = (total[stop - first[0]] - total[first - first[0]]) / (stop - first)[:, None, None, None]
+        own, common = np.sqrt(variance)[..., None] * mean, np.einsum("qak,fkan->fqan", shared, mean)
+        both = np.concatenate([each.reshape(len(frames), -1, body.tree.n_dofs) for each in (own, common)], axis=1)
+        systematic[some] = (both.transpose(0, 2, 1) @ both)[:, upper[0], upper[1]]
     return OtherNoise(information, systematic, found)
+
+
+def filled(total: NDArray, count: NDArray) -> NDArray:
+    """Means (C,) of totals (C,) over counts (C,); the overall mean where the count is 0."""
+    return np.where(count > 0, total / np.maximum(count, 1), total.sum() / max(float(count.sum()), 1.0))
 
 
 def _systematic(found: VarianceComponents, leverage: NDArray, stated: NDArray, independent: bool) -> NDArray:

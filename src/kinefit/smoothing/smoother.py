@@ -142,7 +142,10 @@ def _result(
 ) -> FrameResult:  # fmt: skip
     """Frame f of a solved take, from what the tracker found in it."""
     state, weight = BodyState(take.roots[f], take.angles[f]), take.confidence[f] / np.square(take.channels.sigma)
-    scene = frames.scene_of(state, tracked.time) if take.others is None else take.others.scene(f, take.roots, take.angles)
+    if take.others is None:
+        scene = frames.scene_of(state, tracked.time)
+    else:
+        scene = take.others.scene(f, take.roots, take.angles)
     pixels = tuple(
         replace(
             m, uv=np.where(weight[:, None] > 0, take.uv[f], np.nan), weight=weight, swapped=take.swapped[f],

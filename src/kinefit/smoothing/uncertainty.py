@@ -31,7 +31,7 @@ from kinefit.sensors.channels import Channels
 from kinefit.sensors.points.keypoints import Layout
 from kinefit.sensors.settings import CameraErrors
 from kinefit.smoothing.process_noise import SmoothTake
-from kinefit.smoothing.sensor_noise import OtherNoise, covariance_alone, leverages
+from kinefit.smoothing.sensor_noise import OtherNoise, covariance_alone, filled, leverages
 from kinefit.smoothing.shape_errors import SAMPLED_FRAMES, ShapeErrors
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import stretches
@@ -110,7 +110,7 @@ def with_systematic_errors(
         leverage = leverages(J[used], pushed[used], covariance_alone(body, results[f].state, whole))
         absorbed += np.bincount(rows.group[used], leverage, len(absorbed))
         count += np.bincount(rows.group[used], minlength=len(count))
-    absorbed = np.where(count > 0, absorbed / np.maximum(count, 1), absorbed.sum() / max(count.sum(), 1))
+    absorbed = filled(absorbed, count)
     if channels.view_followed is not None:
         absorbed = 1.0 - (1.0 - absorbed) * (1.0 - channels.view_followed)
     values = _residuals(take)

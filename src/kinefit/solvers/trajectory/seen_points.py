@@ -48,6 +48,15 @@ class SeenPoints:
     member: NDArray | None = None
     shared: NDArray | None = None
 
+    @classmethod
+    def in_metres(cls, points: PointSet, places: NDArray, weight: NDArray, loss: Loss = SQUARED) -> SeenPoints:
+        """Points in metres alone, all with one loss: places (T, K, 3) [m], weight (T, K) [1/m²]."""
+        none = np.zeros(0, np.int64), np.zeros((len(places), 0, 2)), np.zeros((len(places), 0))
+        return cls(
+            Rig(()), NO_POINTS, *none, placed=points, places=places, place_weight=weight, place_loss=loss,
+            robust=len(points),
+        )  # fmt: skip
+
     def equations(self, body: Body) -> MakeEquations:
         """Equations for `trajectory.smoothing.smooth`."""
         tree = body.tree
