@@ -245,7 +245,7 @@ def marker_noise(
         for sensor in markers.sensors:
             own = markers.columns(sensor)
             own = own[weight[f, own] > 0.0]
-            lines, w = J[own].reshape(3 * len(own), -1), np.repeat(weight[f, own], 3)[:, None]
+            lines, w = J[own].reshape(-1, body.tree.n_dofs), np.repeat(weight[f, own], 3)[:, None]
             absorbed[own] += leverages(lines, w * lines, alone).reshape(-1, 3).mean(axis=1)
             count[own] += 1
     found, variance, shared = {}, np.zeros((K, 3)), np.zeros((len(markers.sensors), 3, K))
