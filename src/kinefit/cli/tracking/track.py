@@ -52,7 +52,8 @@ def choices_options(command: Callable) -> Callable:
         _screen.hide_faces_option,
         click.option("--contacts", is_flag=True, help="Keep soles still while they rest on the floor. Always on with "
             "one camera, and with cameras calibrated from the people in view."),
-        click.option("--realtime", is_flag=True, help="Estimate each frame only from earlier frames (no smoothing)."),
+        click.option("--realtime", is_flag=True, help="Estimate each frame only from earlier frames (no smoothing). "
+            "Labelled markers alone: each frame by itself."),
         click.option(
             "--lag", type=float, metavar="SECONDS",
             help="Estimate each frame from earlier frames and this many seconds of later frames, like a live session "
