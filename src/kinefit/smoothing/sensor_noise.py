@@ -23,7 +23,7 @@ from kinefit.sensors.points.markers import MarkerMatched
 from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.smoothing.linearised import OtherSensors, squares_of
 from kinefit.smoothing.process_noise import SmoothTake
-from kinefit.smoothing.spool import Spool, stretches
+from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.solvers.bundle.border_frames import gram
 from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, point_derivatives, product
 from kinefit.solvers.trajectory.seen_points import SeenPoints
@@ -33,7 +33,6 @@ from kinefit.solvers.trajectory.variance_components import VarianceComponents, v
 _RIGID_SURFACE_STDS = 1e-6, 1e-6  # [m], [rad] of surface offsets of a body without joints: it is its surface
 _MIN_SURFACE_STD = 1e-4  # [m] of a surface offset, in place of 0
 _LEVERAGE_FRAMES = 40  # of a take, in which the leverage of each channel is computed
-_MATRIX_FRAMES = 100  # whose (n, n) matrices are made at a time: some 2 MB of each
 _STATED_CHANNELS = 5.0  # channels along one axis, without leverage, that a stated systematic error counts as
 
 
@@ -205,7 +204,7 @@ def marker_information(body: Body, markers: PackedMarkers, roots: NDArray, angle
     """(T, n (n + 1) / 2) information of packed markers at fitted states, the upper triangle of each frame."""
     upper = np.triu_indices(body.tree.n_dofs)
     out = room((len(roots), len(upper[0])))
-    for some in stretches(len(roots), _MATRIX_FRAMES):
+    for some in stretches(len(roots), MATRIX_FRAMES):
         whole = marker_matrices(body, markers.part(some), roots[some], angles[some])
         out[some] = whole[:, upper[0], upper[1]]
     return out
@@ -261,7 +260,7 @@ def marker_noise(
         found[sensor], shared[q][:, own] = noise, noise.shared[0][:, None]
         variance[own] = _systematic(noise, leverage, np.repeat(stated[:, None], 3, axis=1), MarkerMatched.independent)
     systematic, upper = room(information.shape), np.triu_indices(body.tree.n_dofs)
-    for some in stretches(T, _MATRIX_FRAMES):
+    for some in stretches(T, MATRIX_FRAMES):
         frames = np.arange(some.start, some.stop)
         first, stop = np.maximum(frames - half, 0), np.minimum(frames + half + 1, T)
         pushes = np.zeros((stop[-1] - first[0] + 1, K, 3, body.tree.n_dofs))

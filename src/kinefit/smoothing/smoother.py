@@ -25,7 +25,7 @@ from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.linearised import OtherSensors
 from kinefit.smoothing.process_noise import MIN_INLIER_FACTOR, SmoothTake, Strength, estimate, estimate_liveliness
 from kinefit.smoothing.shared_errors import SharedErrors
-from kinefit.smoothing.spool import Spool, stretches
+from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.smoothing.tracked_frames import TrackedFrames, correct_swaps, without_bias
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.smoothing.windows import parts, solved, solved_with_covariances
@@ -33,7 +33,6 @@ from kinefit.solvers.closed import Constraint, on_null_space, onto
 from kinefit.solvers.equations import variances
 from kinefit.solvers.trajectory.smoothing import unpacked
 
-_MATRIX_FRAMES = 100  # whose (n, n) matrices are made at a time: some 2 MB of each
 _NOISE_PARTS = 6  # of a long take, from which its process noise is estimated
 _MIN_PIXELS = 6  # of a frame, with half the rows of other points; a frame with fewer is lost
 _CONTACT_ROUNDS = 2  # of finding foot contacts, the second with the contacts of the first
@@ -113,7 +112,7 @@ def _results(
     """The frames of a solved take, with the matches of keypoints alone; `others` are the matches of all others."""
     body, markers = take.body, take.markers
     out, surfaces, packed = Spool[FrameResult](), False, np.triu_indices(body.tree.n_dofs)
-    for some in stretches(len(take.roots), _MATRIX_FRAMES):
+    for some in stretches(len(take.roots), MATRIX_FRAMES):
         several = range(*some.indices(len(take.roots)))
         covariance = np.empty((len(several), body.tree.n_dofs, body.tree.n_dofs))
         for own, f in zip(covariance, several):
@@ -222,7 +221,7 @@ def _observed(take: SmoothTake) -> tuple[list[NDArray], NDArray]:
     tree, (T, D) = take.body.tree, take.angles.shape
     prior = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
     out, rows = [np.zeros((T, D), bool), np.zeros((T, D), bool)], np.zeros(T)
-    for some in stretches(T, _MATRIX_FRAMES):
+    for some in stretches(T, MATRIX_FRAMES):
         part = take.part(some)
         points = part.solver_points(take.channels.sigma)
         kinds = [points]

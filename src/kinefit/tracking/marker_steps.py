@@ -19,7 +19,7 @@ from kinefit.sensors.base import Measurement
 from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.sensor_noise import marker_matrices
-from kinefit.smoothing.spool import Spool, stretches
+from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.solvers.equations import block_diagonal
 from kinefit.subject.subject import Progress
@@ -27,7 +27,6 @@ from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import TrackedSteps, tracker_of
 
 _SEQUENCE_FRAMES = 6000  # that are fitted in one call
-_MATRIX_FRAMES = 100  # whose (n, n) matrices are made at a time
 
 
 def fit_marker_steps(
@@ -114,7 +113,7 @@ def _poses(body: Body, times: NDArray, roots: NDArray, angles: NDArray) -> _OnDe
 def _assessed(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> Spool[FrameResult]:
     """Fitted poses (F, 4, 4), (F, D) as frames with standard deviations and quality, each by its own markers."""
     out, prior = Spool[FrameResult](), block_diagonal(np.eye(6) / ROOT_PRIOR_STD**2, body.tree.posture_precision)
-    for some in stretches(len(roots), _MATRIX_FRAMES):
+    for some in stretches(len(roots), MATRIX_FRAMES):
         part, at = markers.part(some), (roots[some], angles[some])
         information = marker_matrices(body, part, *at) + prior
         covariances = np.linalg.inv(information)
