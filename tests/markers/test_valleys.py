@@ -10,7 +10,7 @@ from kinefit.bodies import BodyState
 from kinefit.bodies.marker_sets import placement
 from kinefit.markers.valleys import PointTake, profile_frames, resolve_by_motion
 from kinefit.sensors.settings import MARKER_LOSS
-from kinefit.solvers.sequence import fit_sequence, point_equations
+from kinefit.solvers.sequence import fit_sequence
 
 RATE, FRAMES = 60.0, 60
 BODY = load_body("humanoid")
@@ -83,9 +83,7 @@ def test_a_frame_in_a_worse_minimum_takes_the_better_one(bow):
 
 def test_equations_of_points_are_those_of_the_fit(bow):
     take, _, fit, _ = bow
-    C, g, costs = point_equations(BODY, take.points, take.x, sigma=take.sigma, loss=MARKER_LOSS)(
-        fit.Ts_world_root, fit.angles
-    )
+    C, g, costs = take.equations(slice(None))(fit.Ts_world_root, fit.angles)
     away = fit.angles - BODY.tree.usual
     precision = BODY.tree.posture_precision
     np.testing.assert_allclose(costs + np.einsum("fi,ij,fj->f", away, precision, away), fit.costs, rtol=1e-4)

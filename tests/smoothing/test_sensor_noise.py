@@ -17,7 +17,7 @@ from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import squat_and_wave
 from kinefit.smoothing import sensor_noise
-from kinefit.smoothing.linearised import squares_of
+from kinefit.smoothing.linearised import OtherSensors, squares_of
 from kinefit.smoothing.smoother import as_tracked
 from kinefit.solvers.equations import block_diagonal, design, normal_equations
 from kinefit.tracking.run import run
@@ -36,17 +36,22 @@ def tracked():
     recording = Recording.of_frames(steps, Rig(()), rate=20.0)
     frames = run(recording, truth.body, TrackSettings(), start=(0, truth.state(0)))
     take = as_tracked(truth.body, frames, TrackSettings())
-    matched = [take.others.matched(take.others.scene(f, take.roots, take.angles)) for f in range(len(truth))]
-    return truth.body, take, matched
+    assert take.others is None
+    rows = OtherSensors(
+        frames.times, frames.measurements, frames.scene_of, frames.apart, TrackSettings(), {"mocap": 1.0},
+        np.zeros(len(truth)),
+    )  # fmt: skip
+    by_rows = replace(take, markers=None, others=rows)
+    matched = [rows.matched(rows.scene(f, take.roots, take.angles)) for f in range(len(truth))]
+    return truth.body, take, by_rows, matched
 
 
-def test_information_and_lasting_errors_are_sums_over_rows_and_frames(tracked):
-    body, take, matched = tracked
+@pytest.mark.parametrize("packed", [True, False])
+def test_information_and_lasting_errors_are_sums_over_rows_and_frames(tracked, packed):
+    body, block, take, matched = tracked
     n, T = body.tree.n_dofs, len(take.roots)
     none = np.zeros((n, n))
-    found = sensor_noise.other_noise(
-        body, take.others, matched, take.roots, take.angles, lambda f: none, half=HALF
-    )  # fmt: skip
+    found = sensor_noise.noise_of_sensors(block if packed else take, matched, lambda f: none, half=HALF)
     pushes, stated, channels, followed = [], {}, {}, {}
     for f, several in enumerate(matched):
         scene, information = take.others.scene(f, take.roots, take.angles), np.zeros((n, n))
@@ -100,7 +105,7 @@ class Surface(Matched):
 
 @pytest.mark.parametrize("points", [0, 100])
 def test_surfaces_move_the_pose_as_refitting_does(tracked, points):
-    body, take, _ = tracked
+    body, _, take, _ = tracked
     T, n, settings = len(take.roots), body.tree.n_dofs, TrackSettings()
     others = replace(take.others, points=np.full(T, points), scale={})
     matched = [(Surface(body, others.scene(f, take.roots, take.angles).state, f),) for f in range(T)]

@@ -70,54 +70,88 @@ class FrameResult:
 def deviations(
     body: Body, state: BodyState, covariance: NDArray, observed: NDArray | None = None
 ) -> tuple[NDArray, NDArray]:
-    """Standard deviations of the degrees of freedom (n,) [m, rad] and of the joint centres (S, 3) [m].
+    """Standard deviations of one frame's degrees of freedom (n,) [m, rad] and joint centres (S, 3) [m].
+
+    Parameters
+    ----------
+    covariance : (n, n) posterior, the prior included once
+    observed : (D,) bool, see `deviations_of_frames`; default: all
+    """
+    observed = np.ones(len(state.angles), bool) if observed is None else observed
+    moves = joint_moves(body, state)
+    std, joints = deviations_of_frames(body, moves[None], np.asarray(covariance)[None], observed[None])
+    return std[0], joints[0]
+
+
+def deviations_of_frames(
+    body: Body, moves: NDArray, covariances: NDArray, observed: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Standard deviations of the degrees of freedom (F, n) [m, rad] and of the joint centres (F, S, 3) [m].
 
     They are infinite where the data explain less than a tenth of the prior's variance. A joint centre's is infinite
     where unobserved coordinates make up most of its variance, and it reaches what they give it by the prior alone.
 
     Parameters
     ----------
-    covariance : (n, n) posterior, the prior included once
-    observed : (D,) bool, optional
+    moves : (F, S, 3, n) derivatives of the joint centres
+    covariances : (F, n, n) posterior, the prior included once
+    observed : (F, D) bool
         Coordinates that the data observe; others count as unknown whatever their variance.
     """
     tree = body.tree
     prior = np.concatenate([np.full(6, ROOT_PRIOR_STD), tree.posture_std])
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    std = np.sqrt(np.maximum(np.einsum("fii->fi", covariances), 0.0))
     blind = std > UNOBSERVED_STD_RATIO * prior
-    if observed is not None:
-        blind[6:] |= ~observed
-        never = 6 + np.flatnonzero(~observed & np.isfinite(tree.spread))
-        covariance = _with_variances(covariance, never, prior[never] ** 2)
-    blind[:6] &= tree.root_free
-    moves = joint_moves(body, state)
-    of_joints = moves @ covariance
-    variances = np.maximum(np.einsum("...i,...i->...", of_joints, moves), 0.0)
-    joints = np.sqrt(variances)
-    if blind.any():
-        unknown = np.square(moves) @ np.square(np.where(blind, np.minimum(prior, 1e3), 0.0))
-        own, directly, along = covariance[np.ix_(blind, blind)], moves[..., blind], of_joints[..., blind]
-        share = np.einsum("...i,...i->...", along @ _inverse(own), along)
-        share = np.minimum(share, np.einsum("...i,...i->...", directly @ own, directly))
-        most = (unknown > _MIN_JOINT_SHIFT**2) & (share > _MAX_UNOBSERVED_SHARE * variances)
-        joints = np.where(most & (variances > UNOBSERVED_STD_RATIO**2 * unknown), np.inf, joints)
+    blind[:, 6:] |= ~observed
+    blind[:, :6] &= tree.root_free
+    never = ~observed & np.isfinite(tree.spread)
+    joints = np.empty(moves.shape[:3])
+    patterns = np.concatenate([blind, never], axis=1)
+    _, first, group = np.unique(patterns, axis=0, return_index=True, return_inverse=True)
+    for g, one in enumerate(first):
+        frames = np.flatnonzero(group.ravel() == g)
+        joints[frames] = _joint_deviations(
+            moves[frames], covariances[frames], blind[one], 6 + np.flatnonzero(never[one]), prior
+        )
     return np.where(blind, np.inf, std), joints
 
 
+def _joint_deviations(
+    moves: NDArray, covariance: NDArray, blind: NDArray, never: NDArray, prior: NDArray
+) -> NDArray:
+    """(F, S, 3) [m] of frames (F, ...) with the same coordinates blind (n,) bool and never observed (k,) int."""
+    covariance = _with_variances(covariance, never, prior[never] ** 2)
+    F, S, _, n = moves.shape
+    lines = moves.reshape(F, 3 * S, n)
+    of_joints = lines @ covariance
+    variances = np.maximum(np.einsum("fri,fri->fr", of_joints, lines), 0.0)
+    joints = np.sqrt(variances)
+    if blind.any():
+        unknown = np.square(lines) @ np.square(np.where(blind, np.minimum(prior, 1e3), 0.0))
+        own, directly, along = covariance[:, blind][:, :, blind], lines[..., blind], of_joints[..., blind]
+        share = np.einsum("fri,fri->fr", along @ _inverse(own), along)
+        share = np.minimum(share, np.einsum("fri,fri->fr", directly @ own, directly))
+        most = (unknown > _MIN_JOINT_SHIFT**2) & (share > _MAX_UNOBSERVED_SHARE * variances)
+        joints = np.where(most & (variances > UNOBSERVED_STD_RATIO**2 * unknown), np.inf, joints)
+    return joints.reshape(F, S, 3)
+
+
 def _with_variances(covariance: NDArray, some: NDArray, variances: NDArray) -> NDArray:
-    """Covariance (n, n) in which some coordinates (k,) have at least these variances (k,).
+    """Covariances (F, n, n) in which some coordinates (k,) have at least these variances (k,).
 
     All others keep their distribution given those: what data know of a sum of angles stays known.
     """
-    own = covariance[np.ix_(some, some)]
-    along = covariance[:, some] @ _inverse(own)
-    along[some] = np.eye(len(some))
-    more = np.maximum(variances - np.diag(own), 0.0)
-    return np.asarray(covariance + (along * more) @ along.T)
+    if not len(some):
+        return covariance
+    own = covariance[:, some][:, :, some]
+    along = covariance[:, :, some] @ _inverse(own)
+    along[:, some] = np.eye(len(some))
+    more = np.maximum(variances - np.einsum("fii->fi", own), 0.0)
+    return np.asarray(covariance + (along * more[:, None]) @ along.transpose(0, 2, 1))
 
 
 def _inverse(covariance: NDArray) -> NDArray:
-    """Of coordinates that closures may tie to each other: their covariance is then singular."""
+    """Of coordinates (F, k, k) that closures may tie to each other: their covariance is then singular."""
     return np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
 
 
@@ -152,3 +186,31 @@ def frame_result(
         scene.time, scene.state, *std, evidence.segment_quality(scene.body.tree), evidence.lost, evidence.hidden,
         support, iterations, tuple(matched), scene.measurements,
     )  # fmt: skip
+
+
+def frame_results(
+    body: Body, roots: NDArray, angles: NDArray, times: NDArray, covariances: NDArray, evidence: Evidence, *,
+    observed: NDArray, iterations: Sequence[int],
+) -> list[FrameResult]:  # fmt: skip
+    """Several fitted frames at once, without their matches; see `frame_result`.
+
+    Parameters
+    ----------
+    roots, angles, times : (F, 4, 4) [m], (F, D) [rad], (F,) [s]
+    covariances : (F, n, n) posterior, the prior included once
+    evidence : of F frames
+    observed : (F, D) bool
+    iterations : F numbers
+    """
+    states = [BodyState(root, q) for root, q in zip(roots, angles)]
+    moves = np.stack([joint_moves(body, state) for state in states])
+    std, joints = deviations_of_frames(body, moves, covariances, observed)
+    agreeing, contrary = evidence.agreeing.sum(axis=1), evidence.contrary.sum(axis=1)
+    support = agreeing / np.maximum(agreeing + contrary, 1e-12)
+    quality, lost, hidden = evidence.segment_quality(body.tree), evidence.lost, evidence.hidden
+    return [
+        FrameResult(
+            float(times[f]), state, std[f], joints[f], quality[f], lost[f], hidden[f], float(support[f]), iterations[f]
+        )
+        for f, state in enumerate(states)
+    ]  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
+from kinefit._mapped import room
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.marker_sets import find_placement
 from kinefit.errors import TrackingError
@@ -21,8 +22,10 @@ from kinefit.markers.valleys import PointTake, profile_frames, resolve_by_motion
 from kinefit.motion import UP_AXES, Motion, Residuals
 from kinefit.observations import Markers
 from kinefit.sensors.points.markers import of_points
+from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.smoothing.smoother import bridged
+from kinefit.smoothing.spool import stretches
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.solvers.sequence import Certainty, fit_sequence
 
@@ -76,17 +79,36 @@ def fit_markers(
         sigma = np.asarray(sigma, float)[[labels.index(n) for n in points.names]]
     x = columns(markers, points.names)
     sigma = np.broadcast_to(np.asarray(sigma, float), len(points))
-    data = _MarkerData(body, points, x, sigma, loss, limits)
-    roots, angles = _refit_outliers(data, *data.poses(slice(None)))
-    roots, angles, certainty, widened, flat = profile_frames(data, roots, angles, markers.rate)
+    data = MarkerTake(body, points, x, sigma, loss, limits)
+    roots, angles = refit_outliers(data, *data.poses(slice(None)))
+    roots, angles, local, widened, flat = profile_frames(data, roots, angles, markers.rate)
     roots, angles = resolve_by_motion(data, roots, unwrap(body.tree, angles), flat, markers.rate)
-    roots, angles = _interpolate_unobserved(data, roots, angles, certainty, markers.rate)
+    roots, angles = _interpolate_unobserved(data, roots, angles, local, markers.rate)
     return _motion(data, roots, angles, widened, markers, up)
 
 
 @dataclass(frozen=True, eq=False)
-class _MarkerData(PointTake):
+class MarkerTake(PointTake):
     """Markers measured on a body."""
+
+    @classmethod
+    def of(cls, body: Body, markers: PackedMarkers) -> MarkerTake:
+        """Packed markers of a body, within its limits."""
+        x = room(markers.places.shape)
+        for some in stretches(len(x)):
+            x[some] = np.where(markers.stated[some, :, None] > 0.0, markers.places[some], np.nan)
+        return cls(body, markers.points, x, 1.0 / np.sqrt(markers.stated.max(axis=0)), markers.loss, True)
+
+    def part(self, frames: slice) -> MarkerTake:
+        """The markers of some frames."""
+        return replace(self, x=self.x[frames])
+
+    def poses_after(self, last: BodyState) -> tuple[NDArray, NDArray]:
+        """Roots (F, 4, 4) and angles (F, D) [rad], fitted forwards from the state before the first frame."""
+        fit = fit_sequence(
+            self.body, last, self.points, self.x, sigma=self.sigma, loss=self.loss, limits=self.limits, posture=1.0
+        )
+        return fit.Ts_world_root, fit.angles
 
     def poses(self, frames: slice) -> tuple[NDArray, NDArray]:
         """Roots (F, 4, 4) and angles (F, D) [rad] of some frames, fitted without initial pose."""
@@ -101,7 +123,7 @@ class _MarkerData(PointTake):
         return np.where(seen, np.minimum(np.nan_to_num(off), 10.0), 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
 
 
-def _refit_outliers(data: _MarkerData, roots: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
+def refit_outliers(data: MarkerTake, roots: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
     """Fit frames with an outlying misfit again without initial pose; keep the better fit."""
     roots, angles = roots.copy(), angles.copy()
     misfit = data.misfit(roots, angles)
@@ -118,11 +140,11 @@ def _refit_outliers(data: _MarkerData, roots: NDArray, angles: NDArray) -> tuple
 
 
 def _interpolate_unobserved(
-    data: _MarkerData, roots: NDArray, angles: NDArray, certainty: Certainty, rate: float
+    data: MarkerTake, roots: NDArray, angles: NDArray, local: Certainty, rate: float
 ) -> tuple[NDArray, NDArray]:
     """Interpolate unobserved angles and roots from adjacent frames; observed ones stay."""
     tree, x = data.body.tree, data.x
-    std = certainty.dof_std
+    std = local.dof_std
     lost = ~((std[:, :3].max(axis=1) < _MAX_ROOT_STD) & (std[:, 3:6].max(axis=1) < _MAX_ANGLE_STD))
     max_std = np.minimum(np.where(tree.prismatic, _MAX_ROOT_STD, _MAX_ANGLE_STD), UNOBSERVED_STD_RATIO * tree.spread)
     observed = (std[:, 6:] < max_std) & ~lost[:, None]
@@ -150,7 +172,7 @@ def _interpolate_unobserved(
 
 
 def _motion(
-    data: _MarkerData, roots: NDArray, angles: NDArray, certainty: Certainty, markers: Markers, up: str | None
+    data: MarkerTake, roots: NDArray, angles: NDArray, certainty: Certainty, markers: Markers, up: str | None
 ) -> Motion:
     """Assemble the motion; its quality is the share of a segment's evidence that agrees."""
     body, points, x = data.body, data.points, data.x

@@ -17,9 +17,10 @@ from kinefit.frame.results import UNOBSERVED_STD_RATIO
 from kinefit.losses import Loss
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.unwrap import boxes
-from kinefit.solvers.sequence import Certainty, certainty, fit_sequence, point_equations
+from kinefit.solvers.sequence import Certainty, certainty, fit_sequence
 from kinefit.solvers.trajectory.motion_prior import MotionPrior
-from kinefit.solvers.trajectory.smoothing import smooth
+from kinefit.solvers.trajectory.seen_points import SeenPoints
+from kinefit.solvers.trajectory.smoothing import MakeEquations, smooth
 
 SAMPLE_INTERVAL_S = 0.1  # between frames whose coordinates are all profiled
 FINE_INTERVAL_S = 0.03  # the same near a frame that is flat along a coordinate
@@ -43,6 +44,12 @@ class PointTake:
     sigma: NDArray
     loss: Loss
     limits: bool
+
+    def equations(self, frames: slice) -> MakeEquations:
+        """Normal equations of some frames."""
+        x = self.x[frames]
+        weight = np.where(np.isfinite(x).all(axis=2), 1.0 / np.square(self.sigma), 0.0)
+        return SeenPoints.in_metres(self.points, np.nan_to_num(x), weight, self.loss).equations(self.body)
 
 
 def profile_frames(
@@ -220,7 +227,7 @@ def resolve_by_motion(
         span = slice(max(a - margin, 0), b + margin)
         lower, upper, usual = boxes(tree, angles[span])
         bounds = (lower, upper) if take.limits else None
-        equations = point_equations(take.body, take.points, take.x[span], sigma=take.sigma, loss=take.loss)
+        equations = take.equations(span)
         acceleration = np.where(flat[span].any(axis=0), settings.angle_acceleration, FREE_ACCELERATION)
         for livelier in ACCELERATION_FACTORS:
             prior = MotionPrior(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,7 +14,8 @@ from kinefit._threads import side_by_side
 from kinefit.bodies import Body, PointSet
 from kinefit.losses import Loss
 from kinefit.sensors.base import Matched, rows_at
-from kinefit.sensors.channels import Channels
+from kinefit.sensors.channels import Channels, joined
+from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.smoothing.foot_contacts import Contacts
 from kinefit.smoothing.linearised import Linearised, OtherSensors, squares_of, with_quadratic
 from kinefit.smoothing.shared_errors import SharedErrors, shared_by
@@ -64,7 +66,8 @@ class SmoothTake:
 
     `uv` (T, N, 2) [px], `confidence` (T, N); `swapped` (T, N) bool: channels whose sides were exchanged;
     `observed` (T, D) bool: coordinates that a frame nearby observes on its own; `live` (T, n): liveliness, a factor on
-    the process noise; `others`: measurements of all sensors but the keypoints, `linear` their costs at the states;
+    the process noise; `markers`: labelled markers; `others`: measurements of all other sensors, `linear` their costs at
+    the states;
     `speed_std` (n,) [m/s, rad/s]: 90th percentile over frames; `one_view`: one camera is the only sensor, so no other
     view contradicts the errors of its keypoints.
     """
@@ -83,6 +86,7 @@ class SmoothTake:
     loss: Loss
     memory: tuple[float, float]
     contacts: Contacts | None = None
+    markers: PackedMarkers | None = None
     others: OtherSensors | None = None
     linear: Linearised | None = None
     speed_std: NDArray | None = None
@@ -101,21 +105,39 @@ class SmoothTake:
         cut = {name: getattr(self, name)[frames] for name in names}
         return replace(
             self, **cut, contacts=self.contacts and self.contacts.part(frames),
+            markers=self.markers and self.markers.part(frames),
             others=self.others and self.others.part(frames), linear=self.linear and self.linear.part(frames),
         )  # fmt: skip
 
     def solver_points(self, sigma: NDArray, shared: NDArray | None = None) -> SeenPoints:
-        """Keypoints and contacts for the solver, with `sigma` (N,) [px] and `shared` (N,), see `Strength`."""
+        """Keypoints, markers and contacts for the solver, with `sigma` (N,) [px] and `shared` (N,), see `Strength`."""
         errors = SharedErrors.of(self.channels, np.zeros(len(sigma)) if shared is None else shared, sigma)
         out = SeenPoints(
             self.channels.rig, self.points, self.channels.camera, self.uv,
             self.confidence / (np.square(sigma) * (1.0 - errors.share)), self.loss, member=errors.member,
             shared=errors.variance,
         )  # fmt: skip
-        contacts = self.contacts
-        if contacts is None:
+        in_metres = [block for block in (self.markers, self.contacts) if block is not None]
+        if not in_metres:
             return out
-        return replace(out, anchored=contacts.points, anchors=contacts.places, anchor_weight=contacts.weight)
+        if self.markers is not None:
+            out = replace(out, place_loss=self.markers.loss, robust=len(self.markers.points))
+        return replace(
+            out, placed=joined([block.points for block in in_metres]),
+            places=np.concatenate([block.places for block in in_metres], axis=1),
+            place_weight=np.concatenate([block.weight for block in in_metres], axis=1),
+        )  # fmt: skip
+
+    @property
+    def scale(self) -> dict[str, float]:
+        """{sensor: factor on its standard deviation} of all sensors but the keypoints, a number from 1."""
+        return {**(self.markers.scale if self.markers else {}), **(self.others.scale if self.others else {})}
+
+    def scaled(self, scale: Mapping[str, float]) -> SmoothTake:
+        """The take with other factors {sensor: number from 1}."""
+        markers = self.markers and replace(self.markers, scale=_known(self.markers.scale, scale))
+        others = self.others and replace(self.others, scale=_known(self.others.scale, scale))
+        return replace(self, markers=markers, others=others)
 
     def fitted(self, roots: NDArray, angles: NDArray) -> NDArray:
         """(T, N, 2) [px] projections of the points at states (T, 4, 4), (T, D)."""
@@ -216,10 +238,9 @@ def estimate(
         found = Strength(acceleration, sigma, shared)
         change = found.change(strength)
         strength = found
-        if takes[0].others is not None:
-            scale = sensor_scales(takes)
-            change = max(change, _largest_change(takes[0].others.scale, scale))
-            takes = [replace(t, others=t.others and replace(t.others, scale=scale)) for t in takes]
+        scale = sensor_scales(takes)
+        change = max(change, _largest_change(takes[0].scale, scale))
+        takes = [take.scaled(scale) for take in takes]
         if change < _MAX_RELATIVE_CHANGE:
             break
     return strength, takes, count
@@ -230,12 +251,18 @@ def _roughly(strength: Strength, take: SmoothTake) -> tuple[Smoothed, Posterior]
 
 
 def estimate_liveliness(take: SmoothTake, strength: Strength, rounds: int = 3) -> SmoothTake:
-    """The take with its liveliness estimated, for a known strength; its states are those of the last round."""
+    """The take with its liveliness estimated, for a known strength; its states are those of the last round.
+
+    `rounds` is the most; they end when no liveliness changes by more than a twentieth.
+    """
     for _ in range(rounds):
         take = take.renewed()
         fit, post = _roughly(strength, take)
         live = _liveliness(take.body, take.dt, *_changes(take, fit, post))
+        change = float(np.abs(np.log(live / take.live)).max())
         take = replace(take, roots=fit.roots, angles=fit.angles, live=live)
+        if change < _MAX_RELATIVE_CHANGE:
+            break
     return take
 
 
@@ -247,7 +274,15 @@ def sensor_scales(takes: list[SmoothTake]) -> dict[str, float]:
     squares: dict[str, list[NDArray]] = {}
     skipped: set[str] = set()  # sensors whose rows, of one kind in all frames, have no residuals to estimate noise from
     for take in takes:
-        assert take.others is not None and take.linear is not None
+        if take.markers is not None:
+            gaps = take.markers.gaps(take.body, take.roots, take.angles)
+            inlier = take.markers.factors(gaps) > MIN_INLIER_FACTOR
+            square = take.markers.stated[..., None] * np.square(gaps)
+            for sensor in take.markers.sensors:
+                own = take.markers.columns(sensor)
+                squares.setdefault(sensor, []).append(square[:, own][inlier[:, own]].ravel())
+        if take.others is None or take.linear is None:
+            continue
         for f, matched in enumerate(take.linear.matched):
             scene = take.others.scene(f, take.roots, take.angles)
             for m in matched:
@@ -263,6 +298,10 @@ def sensor_scales(takes: list[SmoothTake]) -> dict[str, float]:
         name: float(np.sqrt(max(np.median(s) / _MEDIAN_SQUARE_1D, 1.0))) if len(s) >= _MIN_ROWS else 1.0
         for name, s in inliers.items()
     }
+
+
+def _known(old: Mapping[str, float], new: Mapping[str, float]) -> dict[str, float]:
+    return {name: new.get(name, value) for name, value in old.items()}
 
 
 def _largest_change(old: dict[str, float], new: dict[str, float]) -> float:

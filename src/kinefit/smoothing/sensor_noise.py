@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._mapped import room
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure
 from kinefit.frame.fit import ignores_surface_offsets, rows_of_points
@@ -18,10 +19,15 @@ from kinefit.frame.skin import skin_of
 from kinefit.rows import DofRows, Rows, weaker
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import ChannelResiduals
+from kinefit.sensors.points.markers import MarkerMatched
+from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.smoothing.linearised import OtherSensors, squares_of
-from kinefit.smoothing.spool import Spool
+from kinefit.smoothing.process_noise import SmoothTake
+from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.solvers.bundle.border_frames import gram
-from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, product
+from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, point_derivatives, product
+from kinefit.solvers.trajectory.seen_points import SeenPoints
+from kinefit.solvers.trajectory.smoothing import unpacked
 from kinefit.solvers.trajectory.variance_components import VarianceComponents, variance_components
 
 _RIGID_SURFACE_STDS = 1e-6, 1e-6  # [m], [rad] of surface offsets of a body without joints: it is its surface
@@ -53,6 +59,13 @@ class OtherNoise:
     def pooled(self, f: int, half: int) -> tuple[NDArray, NDArray]:
         """(n, n) information, averaged over `half` (int) frames to either side, and `systematic` (n, n) of a frame."""
         return _square(self.information[max(f - half, 0) : f + half + 1].mean(axis=0)), _square(self.systematic[f])
+
+    def __add__(self, other: OtherNoise) -> OtherNoise:
+        """The noise of both, of different sensors."""
+        return OtherNoise(
+            self.information + other.information, self.systematic + other.systematic,
+            {**self.components, **other.components},
+        )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
         """The variance components in a few numbers, by sensor."""
@@ -155,6 +168,117 @@ def other_noise(
             pushed_by.append(gram(both, both)[upper])
         systematic[f] = np.sum(pushed_by, axis=0)
     return OtherNoise(information, systematic, found)
+
+
+def noise_of_sensors(
+    take: SmoothTake, matched: Sequence[tuple[Matched, ...]] | None, pixels: Callable[[int], NDArray], *,
+    half: int = 0, surfaces: bool = True,
+) -> OtherNoise | None:  # fmt: skip
+    """Estimate the noise of all sensors but the keypoints, packed markers too; None without such sensors.
+
+    Parameters
+    ----------
+    matched : T lists of matches of `take.others`; None without them
+    pixels, half, surfaces : see `other_noise`
+    """
+    body, roots, angles, markers = take.body, take.roots, take.angles, take.markers
+    of_markers = None if markers is None else marker_information(body, markers, roots, angles)
+
+    def points(f: int) -> NDArray:
+        return pixels(f) if of_markers is None else pixels(f) + _square(of_markers[f])
+
+    others = None
+    if take.others is not None and matched is not None:
+        others = other_noise(body, take.others, matched, roots, angles, points, half=half, surfaces=surfaces)
+    if markers is None or of_markers is None:
+        return others
+
+    def rest(f: int) -> NDArray:
+        return pixels(f) if others is None else pixels(f) + _square(others.information[f])
+
+    found = marker_noise(body, markers, of_markers, roots, angles, rest, half=half)
+    return found if others is None else found + others
+
+
+def marker_information(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> NDArray:
+    """(T, n (n + 1) / 2) information of packed markers at fitted states, the upper triangle of each frame."""
+    upper = np.triu_indices(body.tree.n_dofs)
+    out = room((len(roots), len(upper[0])))
+    for some in stretches(len(roots), MATRIX_FRAMES):
+        whole = marker_matrices(body, markers.part(some), roots[some], angles[some])
+        out[some] = whole[:, upper[0], upper[1]]
+    return out
+
+
+def marker_matrices(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> NDArray:
+    """(T, n, n) information of packed markers at fitted states."""
+    weight = markers.factors(markers.gaps(body, roots, angles)) * markers.weight
+    packed, _, _ = SeenPoints.in_metres(markers.points, markers.places, weight).equations(body)(roots, angles)
+    return unpacked(packed, body.tree)
+
+
+def marker_noise(
+    body: Body, markers: PackedMarkers, information: NDArray, roots: NDArray, angles: NDArray,
+    rest: Callable[[int], NDArray], *, half: int = 0,
+) -> OtherNoise:  # fmt: skip
+    """Estimate the noise of packed markers from their residuals at fitted states, as `other_noise` does.
+
+    Parameters
+    ----------
+    information : of `marker_information`
+    roots, angles : (T, 4, 4), (T, D) fitted
+    rest : frame -> (n, n) information of all other sensors, keypoints too
+    half : frames to either side within the correlation time of the motion
+    """
+    T, K = len(roots), len(markers.points)
+    gaps, weight = room(markers.places.shape), room(markers.stated.shape)
+    for some in stretches(T):
+        part = markers.part(some)
+        gaps[some] = part.gaps(body, roots[some], angles[some])
+        weight[some] = part.factors(gaps[some]) * part.weight
+    absorbed, count = np.zeros(K), np.zeros(K)
+    for f in np.linspace(0, T - 1, min(_LEVERAGE_FRAMES, T)).astype(int):
+        state = BodyState(roots[f], angles[f])
+        J = point_derivatives(body, state, markers.points)
+        alone = covariance_alone(body, state, _square(information[f]) + rest(f))
+        for sensor in markers.sensors:
+            own = markers.columns(sensor)
+            own = own[weight[f, own] > 0.0]
+            lines, w = J[own].reshape(-1, body.tree.n_dofs), np.repeat(weight[f, own], 3)[:, None]
+            absorbed[own] += leverages(lines, w * lines, alone).reshape(-1, 3).mean(axis=1)
+            count[own] += 1
+    found, variance, shared = {}, np.zeros((K, 3)), np.zeros((len(markers.sensors), 3, K))
+    for q, sensor in enumerate(markers.sensors):
+        own = markers.columns(sensor)
+        leverage = filled(absorbed[own], count[own])
+        noise = variance_components(
+            gaps[:, own], markers.times, leverage=leverage, jitter_leverage=leverage / (2 * half + 1)
+        )
+        seen = weight[:, own] > 0.0
+        stated = np.where(seen, 1.0 / np.where(seen, markers.stated[:, own], 1.0), 0.0)
+        stated = MarkerMatched.lasts * filled(stated.sum(axis=0), np.count_nonzero(seen, axis=0))
+        found[sensor], shared[q][:, own] = noise, noise.shared[0][:, None]
+        variance[own] = _systematic(noise, leverage, np.repeat(stated[:, None], 3, axis=1), MarkerMatched.independent)
+    systematic, upper = room(information.shape), np.triu_indices(body.tree.n_dofs)
+    for some in stretches(T, MATRIX_FRAMES):
+        frames = np.arange(some.start, some.stop)
+        first, stop = np.maximum(frames - half, 0), np.minimum(frames + half + 1, T)
+        pushes = np.zeros((stop[-1] - first[0] + 1, K, 3, body.tree.n_dofs))
+        for f in range(first[0], stop[-1]):
+            pushes[f - first[0] + 1] = weight[f, :, None, None] * point_derivatives(
+                body, BodyState(roots[f], angles[f]), markers.points
+            )
+        total = np.cumsum(pushes, axis=0)
+        mean = (total[stop - first[0]] - total[first - first[0]]) / (stop - first)[:, None, None, None]
+        own, common = np.sqrt(variance)[..., None] * mean, np.einsum("qak,fkan->fqan", shared, mean)
+        both = np.concatenate([each.reshape(len(frames), -1, body.tree.n_dofs) for each in (own, common)], axis=1)
+        systematic[some] = (both.transpose(0, 2, 1) @ both)[:, upper[0], upper[1]]
+    return OtherNoise(information, systematic, found)
+
+
+def filled(total: NDArray, count: NDArray) -> NDArray:
+    """Means (C,) of totals (C,) over counts (C,); the overall mean where the count is 0."""
+    return np.where(count > 0, total / np.maximum(count, 1), total.sum() / max(float(count.sum()), 1.0))
 
 
 def _systematic(found: VarianceComponents, leverage: NDArray, stated: NDArray, independent: bool) -> NDArray:

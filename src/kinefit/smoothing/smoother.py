@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._mapped import release
+from kinefit._threads import side_by_side
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences.closures import hard_equations, looped
 from kinefit.findings import runs_of
-from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult, frame_result
+from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult, frame_result, frame_results
 from kinefit.frame.trust import unknown_joints
 from kinefit.sensors.base import Matched, pixels_of
-from kinefit.sensors.channels import Channels
 from kinefit.sensors.evidence import moves_points, near
 from kinefit.sensors.points.views import find_swaps, limb_groups
 from kinefit.sensors.settings import TrackSettings
@@ -25,15 +26,14 @@ from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.linearised import OtherSensors
 from kinefit.smoothing.process_noise import MIN_INLIER_FACTOR, SmoothTake, Strength, estimate, estimate_liveliness
 from kinefit.smoothing.shared_errors import SharedErrors
-from kinefit.smoothing.spool import Spool, stretches
+from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.smoothing.tracked_frames import TrackedFrames, correct_swaps, without_bias
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.smoothing.windows import parts, solved, solved_with_covariances
 from kinefit.solvers.closed import Constraint, on_null_space, onto
 from kinefit.solvers.equations import variances
-from kinefit.solvers.trajectory import _kernels_smoothing
+from kinefit.solvers.trajectory.smoothing import unpacked
 
-_MATRIX_FRAMES = 100  # whose (n, n) matrices are made at a time: some 2 MB of each
 _NOISE_PARTS = 6  # of a long take, from which its process noise is estimated
 _MIN_PIXELS = 6  # of a frame, with half the rows of other points; a frame with fewer is lost
 _CONTACT_ROUNDS = 2  # of finding foot contacts, the second with the contacts of the first
@@ -48,7 +48,7 @@ class SmoothedTake:
     ----------
     results : F frames, with the matches of keypoints alone; read on demand
     take : SmoothTake at the solution
-    matched : F lists, the matches of all other sensors; None if there are none
+    matched : F lists, the matches of all sensors but keypoints and packed markers; None if there are none
     weight : (F, N) [1/px²] of every channel in the fit, robust factor included
     provenance : estimated noise, for `Motion.provenance`
     shared : errors that keypoints of one segment share, as the fit assumed them
@@ -71,7 +71,7 @@ def smooth_results(
     """Smooth tracked frames of any sensors jointly.
 
     Outliers and left-right swaps are those of the track, decided again once. Correspondences of sensors other than
-    keypoints are matched again in every round.
+    keypoints and labelled markers are matched again in every round.
 
     Parameters
     ----------
@@ -106,31 +106,62 @@ def smooth_results(
     for some in stretches(len(fit_weight)):
         fit_weight[some] *= take.confidence[some] / np.square(strength.sigma)
     release(fit_weight, take.confidence)
-    surfaces = False
-    smoothed, packed = Spool[FrameResult](), np.triu_indices(body.tree.n_dofs)
-    covariance = np.empty((body.tree.n_dofs,) * 2)
-    for f, result in enumerate(frames.results):
-        state, weight = BodyState(take.roots[f], take.angles[f]), take.confidence[f] / np.square(channels.sigma)
-        others = take.others
-        scene = frames.scene_of(state, result.time) if others is None else others.scene(f, take.roots, take.angles)
-        pixels = tuple(
-            replace(
-                m, uv=np.where(weight[:, None] > 0, take.uv[f], np.nan), weight=weight, swapped=swapped[f],
-                beside=m.measurement.layout.beside(scene),
-            )
-            for m in pixels_of(result.matched)
-        )  # fmt: skip
-        more = () if others_matched is None else others_matched[f]
-        covariance[packed] = covariance.T[packed] = covariances[f]
-        if hard is not None:
-            covariance = on_null_space(covariance, hard(state)[1])
-        frame = frame_result(scene, covariance, (*pixels, *more), result.iterations, observed=take.observed[f])
-        surfaces |= any(m.shows_surface for m in more)
-        smoothed.append(replace(frame, matched=pixels, measurements=()))
-    if surfaces:
-        smoothed = _with_unknown_joints(body, smoothed, round(_UNKNOWN_TIME * frames.rate))
+    smoothed = _results(take, frames, covariances, others_matched, hard)
     shared = SharedErrors.of(channels, strength.shared, strength.sigma)
     return SmoothedTake(smoothed, take, others_matched, fit_weight, _provenance(take, strength, rounds), shared, border)
+
+
+def _results(
+    take: SmoothTake, frames: TrackedFrames, covariances: Sequence[NDArray],
+    others: Sequence[tuple[Matched, ...]] | None, hard: Constraint | None,
+) -> Spool[FrameResult]:  # fmt: skip
+    """The frames of a solved take, with the matches of keypoints alone; `others` are the matches of all others."""
+    body, markers = take.body, take.markers
+    out, surfaces, packed = Spool[FrameResult](), False, np.triu_indices(body.tree.n_dofs)
+    for some in stretches(len(take.roots), MATRIX_FRAMES):
+        several = range(*some.indices(len(take.roots)))
+        covariance = np.empty((len(several), body.tree.n_dofs, body.tree.n_dofs))
+        for own, f in zip(covariance, several):
+            own[packed] = own.T[packed] = covariances[f]
+            if hard is not None:
+                own[:] = on_null_space(own, hard(BodyState(take.roots[f], take.angles[f]))[1])
+        tracked = [frames.results[f] for f in several]
+        if markers is not None and others is None and not len(take.channels.column):
+            part = markers.part(some)
+            at = take.roots[some], take.angles[some]
+            made = frame_results(
+                body, *at, frames.times[some], covariance, part.evidence(body, part.gaps(body, *at)),
+                observed=take.observed[some], iterations=[r.iterations for r in tracked],
+            )  # fmt: skip
+        else:
+            made = [_result(take, frames, f, r, own, others) for f, r, own in zip(several, tracked, covariance)]
+            surfaces |= any(m.shows_surface for f in several for m in (() if others is None else others[f]))
+        for result in made:
+            out.append(result)
+    return _with_unknown_joints(body, out, round(_UNKNOWN_TIME * frames.rate)) if surfaces else out
+
+
+def _result(
+    take: SmoothTake, frames: TrackedFrames, f: int, tracked: FrameResult, covariance: NDArray,
+    others: Sequence[tuple[Matched, ...]] | None,
+) -> FrameResult:  # fmt: skip
+    """Frame f of a solved take, from what the tracker found in it."""
+    state, weight = BodyState(take.roots[f], take.angles[f]), take.confidence[f] / np.square(take.channels.sigma)
+    if take.others is None:
+        scene = frames.scene_of(state, tracked.time)
+    else:
+        scene = take.others.scene(f, take.roots, take.angles)
+    pixels = tuple(
+        replace(
+            m, uv=np.where(weight[:, None] > 0, take.uv[f], np.nan), weight=weight, swapped=take.swapped[f],
+            beside=m.measurement.layout.beside(scene),
+        )
+        for m in pixels_of(tracked.matched)
+    )  # fmt: skip
+    markers = () if take.markers is None else take.markers.matched(f, scene)
+    matched = (*pixels, *markers, *(() if others is None else others[f]))
+    frame = frame_result(scene, covariance, matched, tracked.iterations, observed=take.observed[f])
+    return replace(frame, matched=pixels, measurements=())
 
 
 def _closed(take: SmoothTake, hard: Constraint) -> SmoothTake:
@@ -163,24 +194,26 @@ def as_tracked(body: Body, frames: TrackedFrames, settings: TrackSettings) -> Sm
     points = PointSet(names, channels.points.segments[channels.column], channels.points.points[channels.column])
     all_observed = np.ones((len(roots), len(body.tree.coordinates)), bool)
     uv, confidence = correct_swaps(channels, swapped)
-    sensors, others = dict.fromkeys((m.sensor for several in frames.measurements for m in several), 1.0), None
+    markers, measurements = frames.packed_markers(body, settings)
+    sensors, others = dict.fromkeys((m.sensor for several in measurements for m in several), 1.0), None
     if sensors or body.closures:
         rows = 2 * np.count_nonzero(channels.weight, axis=1)
+        rows += 0 if markers is None else 3 * np.count_nonzero(markers.stated, axis=1)
         others = OtherSensors(
-            frames.times, frames.measurements, frames.scene_of, frames.apart, settings, sensors, rows
+            frames.times, measurements, frames.scene_of, frames.apart, settings, sensors, rows
         )  # fmt: skip
     return SmoothTake(
         body, channels, points, without_bias(body, channels, uv, roots, angles), confidence, swapped, roots, angles,
         all_observed, np.ones((len(roots), body.tree.n_dofs)), 1.0 / frames.rate, settings.loss,
-        (settings.acceleration_memory, settings.smooth_memory), others=others,
+        (settings.acceleration_memory, settings.smooth_memory), markers=markers, others=others,
     )  # fmt: skip
 
 
 def _take(take: SmoothTake, settings: TrackSettings) -> SmoothTake:
     """The take with continuous angles, lost frames filled, and its observed coordinates."""
-    body, channels, others, rate = take.body, take.channels, take.others, 1.0 / take.dt
+    body, channels, rate = take.body, take.channels, 1.0 / take.dt
     inliers = take.factors_at_states(channels.sigma) > MIN_INLIER_FACTOR
-    alone, rows = _observed(take, channels, others)
+    alone, rows = _observed(take)
     moves_keypoint = moves_points(body, take.points, inliers, take.roots, take.angles)
     observed = alone[0] & (moves_keypoint | looped(body)) | alone[1]
     lost = inliers.sum(axis=1) + 0.5 * rows < _MIN_PIXELS
@@ -189,21 +222,24 @@ def _take(take: SmoothTake, settings: TrackSettings) -> SmoothTake:
     return replace(take, roots=roots, angles=angles, observed=observed)
 
 
-def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None) -> tuple[list[NDArray], NDArray]:
+def _observed(take: SmoothTake) -> tuple[list[NDArray], NDArray]:
     """Coordinates (F, D) that each frame observes: by all sensors, by all but keypoints; rows of the latter (F,)."""
     tree, (T, D) = take.body.tree, take.angles.shape
     prior = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
     out, rows = [np.zeros((T, D), bool), np.zeros((T, D), bool)], np.zeros(T)
-    for some in stretches(T, _MATRIX_FRAMES):
+    for some in stretches(T, MATRIX_FRAMES):
         part = take.part(some)
-        packed, _, _ = part.solver_points(channels.sigma).equations(take.body)(part.roots, part.angles)
-        both = np.zeros((len(part.roots), *prior.shape))
-        _kernels_smoothing.add_packed(packed, tree.chain, tree.depth, both)
-        both += np.tril(both, -1).transpose(0, 2, 1)
-        found = [both]
-        if others is not None:
-            linear = others.linearised(take.body, take.roots, take.angles, frames=range(some.start, some.stop))
-            found, rows[some] = [both + linear.H, linear.H], linear.rows
+        points = part.solver_points(take.channels.sigma)
+        kinds = [points]
+        if take.markers is not None or take.others is not None:
+            kinds.append(replace(points, weight=np.zeros_like(points.weight)))
+        found = [unpacked(of.equations(take.body)(part.roots, part.angles)[0], tree) for of in kinds]
+        if part.markers is not None:
+            gaps = part.markers.gaps(part.body, part.roots, part.angles)
+            rows[some] += 3 * np.count_nonzero(part.markers.factors(gaps) > MIN_INLIER_FACTOR, axis=1)
+        if take.others is not None:
+            linear = take.others.linearised(take.body, take.roots, take.angles, frames=range(some.start, some.stop))
+            found, rows[some] = [H + linear.H for H in found], rows[some] + linear.rows
         for observed, matrices in zip(out, found):
             variance = np.array([variances(H + prior)[6:] for H in matrices])
             observed[some] = variance <= np.square(UNOBSERVED_STD_RATIO * tree.spread)
@@ -219,11 +255,13 @@ def _estimate(
     start = settings.root_acceleration, settings.angle_acceleration
     strength, pieces, rounds = estimate([take.part(windows[i]) for i in chosen], start, settings.smooth_rounds)
     done = dict(zip(chosen.tolist(), pieces, strict=True))
-    if take.others is not None and pieces[0].others is not None:
-        take = replace(take, others=replace(take.others, scale=pieces[0].others.scale))
+    take = take.scaled(pieces[0].scale)
     roots, angles, live = np.array(take.roots), np.array(take.angles), np.array(take.live)
+    left = (take.part(whole) for i, whole in enumerate(windows) if i not in done)
+    lively = partial(estimate_liveliness, strength=strength)
+    found = map(lively, left) if take.others is not None else side_by_side(lively, left)
     for i, (whole, kept) in enumerate(parts(len(take.roots), window, overlap)):
-        piece = done[i] if i in done else estimate_liveliness(take.part(whole), strength)
+        piece = done[i] if i in done else next(found)
         release(take.uv, take.confidence)
         inside = slice(kept.start - whole.start, kept.stop - whole.start)
         roots[kept], angles[kept], live[kept] = piece.roots[inside], piece.angles[inside], piece.live[inside]
@@ -257,7 +295,6 @@ def _provenance(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, 
         for q, label in enumerate(take.channels.sources)
     }
     speeds = {} if take.speed_std is None else dict(zip(take.body.dof_names, take.speed_std.round(4).tolist()))
-    scale = {} if take.others is None else {name: round(v, 2) for name, v in take.others.scale.items()}
     return {
         "acceleration": {name: float(f"{v:.4g}") for name, v in zip(coordinates, values, strict=True)},
         "acceleration_memory": take.memory[0],
@@ -271,7 +308,7 @@ def _provenance(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, 
             }
             for q, label in enumerate(take.channels.sources)
         },
-        "sigma_factor": scale,
+        "sigma_factor": {name: round(v, 2) for name, v in take.scale.items()},
         "liveliest": round(float(take.live.max()), 2),
         "contacts": 0 if take.contacts is None else int(np.any(take.contacts.weight > 0, axis=1).sum()),
         "rounds": rounds,

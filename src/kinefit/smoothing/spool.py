@@ -21,6 +21,10 @@ STRETCH = 2000
 """Frames for which arrays over all channels are made at a time."""
 
 
+MATRIX_FRAMES = 100
+"""Frames whose (n, n) matrices are made at a time: some 2 MB of each."""
+
+
 def stretches(frames: int, length: int | None = None) -> list[slice]:
     """Slices of a take, each of `length` frames at most; default: `STRETCH`, which keeps arrays of channels small."""
     length = length or STRETCH

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,11 @@ from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
 from kinefit.sensors.base import Leftover, Measurement, pixels_of
 from kinefit.sensors.channels import Channels
+from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.sensors.points.views import beside, trunks
+from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.linearised import ApartRows, SceneOf
-from kinefit.smoothing.spool import STRETCH, stretches
+from kinefit.smoothing.spool import STRETCH, Spool, stretches
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +32,7 @@ class TrackedFrames:
     times : (F,) [s]
     rate : float [Hz]
     scene_of, apart : of the tracker, see `lag_frame.TrackerLike`
+    markers : labelled markers, if these are the only sensor and all frames were fitted as one sequence
     """
 
     results: Sequence[FrameResult]
@@ -39,6 +42,7 @@ class TrackedFrames:
     rate: float
     scene_of: SceneOf
     apart: ApartRows
+    markers: PackedMarkers | None = field(default=None, kw_only=True)
 
     def pixels(self) -> tuple[Channels, NDArray]:
         """Keypoints of all frames as measured, and (F, N) bool: channels whose left and right the tracker swapped."""
@@ -59,6 +63,26 @@ class TrackedFrames:
         if layout is None:
             return Channels.none(self.scene_of(self.results[0].state, 0.0).rig, F), swapped
         return replace(layout.channels, uv=uv, confidence=confidence, sides_known=sides_known), swapped
+
+    def packed_markers(
+        self, body: Body, settings: TrackSettings
+    ) -> tuple[PackedMarkers | None, Sequence[tuple[Measurement, ...]]]:
+        """Labelled markers of all frames as one block, and the measurements of all other sensors.
+
+        Joints that move with morphs need rows: there are then no packed markers.
+        """
+        if self.markers is not None:
+            return self.markers, ()
+        markers = None
+        if len(self.results) and self.scene_of(self.results[0].state, 0.0).morphing is None:
+            markers = PackedMarkers.of(body, self.measurements, self.times, settings.marker_loss)
+        if markers is None:
+            return None, self.measurements
+        packed = set(markers.sensors)
+        rest = Spool[tuple[Measurement, ...]]()
+        for several in self.measurements:
+            rest.append(tuple(m for m in several if m.sensor not in packed))
+        return markers, rest
 
 
 def correct_swaps(channels: Channels, swapped: NDArray) -> tuple[NDArray, NDArray]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,7 @@ from kinefit.sensors.channels import Channels
 from kinefit.sensors.points.keypoints import Layout
 from kinefit.sensors.settings import CameraErrors
 from kinefit.smoothing.process_noise import SmoothTake
-from kinefit.smoothing.sensor_noise import OtherNoise, covariance_alone, leverages
+from kinefit.smoothing.sensor_noise import OtherNoise, covariance_alone, filled, leverages
 from kinefit.smoothing.shape_errors import SAMPLED_FRAMES, ShapeErrors
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import stretches
@@ -109,7 +110,7 @@ def with_systematic_errors(
         leverage = leverages(J[used], pushed[used], covariance_alone(body, results[f].state, whole))
         absorbed += np.bincount(rows.group[used], leverage, len(absorbed))
         count += np.bincount(rows.group[used], minlength=len(count))
-    absorbed = np.where(count > 0, absorbed / np.maximum(count, 1), absorbed.sum() / max(count.sum(), 1))
+    absorbed = filled(absorbed, count)
     if channels.view_followed is not None:
         absorbed = 1.0 - (1.0 - absorbed) * (1.0 - channels.view_followed)
     values = _residuals(take)
@@ -130,11 +131,22 @@ def with_systematic_errors(
     shapes = [answer(list(few), [errors.alone for errors in few.values()]) for answer in answers]
     kept = _KeyFrames.of(few, shapes, len(results), rate, noise.drift_time)
 
-    def inflated() -> Iterator[FrameResult]:
-        for f, result in enumerate(results):
+    def variances() -> Iterator[tuple[NDArray, NDArray]]:
+        """Of every frame's degrees of freedom and joints: interpolated between key frames two or more frames apart."""
+        keys = kept.errors.frames
+        keys = keys if np.diff(keys).min(initial=2) >= 2 else np.arange(len(results))
+        before, now = (np.zeros(0), np.zeros(0)), (np.zeros(0), np.zeros(0))
+        for last, f in pairwise([-1, *keys.tolist()]):
             errors = few.pop(f, None) or errors_at(f)
             kept.add(f, errors, shapes)
-            dofs, joints = np.maximum(np.diag(errors.dofs), 0.0), errors.joints
+            before, now = now, (np.maximum(np.diag(errors.dofs), 0.0), errors.joints)
+            for k in range(last + 1, f):
+                share = (k - last) / (f - last)
+                yield (1.0 - share) * before[0] + share * now[0], (1.0 - share) * before[1] + share * now[1]
+            yield now
+
+    def inflated() -> Iterator[FrameResult]:
+        for f, (result, (dofs, joints)) in enumerate(zip(results, variances())):
             for shape in shapes:
                 dofs, joints = (variance + added for variance, added in zip((dofs, joints), shape.at(f)))
             yield replace(

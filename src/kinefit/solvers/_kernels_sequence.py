@@ -154,28 +154,6 @@ def fit_sequence(
 
 
 @jit
-def point_equations(
-    parents, dof_start, chain, depth, prismatic, axes, rest_joints, owner, rest, target, weight, kind, scale,
-    roots, angles, C, g, costs,
-):  # fmt: skip
-    """Normal equations of frames at roots (F, 4, 4), angles (F, D): C (F, n, m) packed, g (F, n), costs (F,).
-
-    Points as in `fit_sequence`.
-    """
-    size = 3 * owner.size
-    data, segment, group = np.empty((8, size)), np.empty(size, np.int64), np.empty(size, np.int64)
-    factor, blocks = np.empty(size), np.empty((parents.size, 27))
-    frames, screws = np.empty((parents.size, 12)), np.empty((axes.shape[0], 6))
-    for f in range(roots.shape[0]):
-        forward(parents, dof_start, prismatic, axes, rest_joints, roots[f], angles[f], frames, screws)
-        count = point_rows(frames, owner, rest, target[f], weight[f], data, segment, group, 0)
-        costs[f] = assemble(
-            data, segment, group, count, kind, scale, roots[f, :3, 3], parents, dof_start, chain, depth, screws,
-            factor, blocks, C[f], g[f],
-        )  # fmt: skip
-
-
-@jit
 def certainties(
     parents, dof_start, dof_parent, last_dof, chain, depth, prismatic, axes, rest_joints,
     owner, rest, target, weight, usual, posture, prior_pairs, prior, wide, wide_depth, place, kind, scale,

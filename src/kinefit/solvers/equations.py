@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.bodies import Body, BodyState
+from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows, DofRows, ParameterRows, Rows, sort_out
@@ -362,8 +362,20 @@ def square_root(covariance: NDArray) -> NDArray:
 
 def joint_moves(body: Body, state: BodyState) -> NDArray:
     """(S, 3, n) derivatives of every joint centre, along the world's axes, by every degree of freedom."""
+    return _moves(body, state, np.arange(len(body.tree.segments)), body.tree.rest)
+
+
+def point_derivatives(body: Body, state: BodyState, points: PointSet) -> NDArray:
+    """(K, 3, n) derivatives of points of the body, along the world's axes, by every degree of freedom."""
+    return _moves(body, state, points.segments, body.points_rest(points))
+
+
+def _moves(body: Body, state: BodyState, segments: NDArray, rest: NDArray) -> NDArray:
+    """(K, 3, n) derivatives of points (K, 3) [m] of the rest pose, on segments (K,)."""
     tree = body.tree
     frames, screws = tree.forward(state.T_world_root, state.angles)
-    moves = np.empty((len(tree.segments), 3, tree.n_dofs))
-    _kernels.joint_moves(frames, screws, tree.rest, state.T_world_root, tree.dof_parent, tree.last_dof, moves)
+    moves = np.empty((len(segments), 3, tree.n_dofs))
+    _kernels.joint_moves(
+        frames[segments], screws, rest, state.T_world_root, tree.dof_parent, tree.last_dof[segments], moves
+    )
     return moves

@@ -13,10 +13,8 @@ from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
 from kinefit.solvers._kernels_sequence import certainties as _certainties
 from kinefit.solvers._kernels_sequence import fit_sequence as _fit_sequence
-from kinefit.solvers._kernels_sequence import point_equations as _point_equations
 from kinefit.solvers.equations import lock
 from kinefit.solvers.least_squares import bounds_of
-from kinefit.solvers.trajectory.smoothing import Equations, MakeEquations
 
 _NO_POINTS = PointSet((), np.empty(0, np.int64), np.empty((0, 3)))
 
@@ -182,29 +180,3 @@ def certainty(
         np.ascontiguousarray(angles, float), dof_std, joint_std, factors,
     )  # fmt: skip
     return Certainty(dof_std, joint_std, factors)
-
-
-def point_equations(
-    body: Body, points: PointSet, x_world: NDArray, *, sigma: NDArray, loss: Loss = SQUARED
-) -> MakeEquations:
-    """Equations of points for `trajectory.smoothing.smooth`.
-
-    Parameters
-    ----------
-    x_world : (F, K, 3) [m] measured points; NaN for missing ones
-    sigma : (K,) or (F, K) [m]
-    """
-    tree, measured = body.tree, np.isfinite(x_world).all(axis=2)
-    weight = np.where(measured, 1.0 / np.square(sigma), 0.0)
-    x, rest = np.nan_to_num(x_world), body.points_rest(points)
-
-    def make(roots: NDArray, angles: NDArray) -> Equations:
-        F = len(roots)
-        C, g, costs = np.empty((F, *tree.chain.shape)), np.empty((F, tree.n_dofs)), np.empty(F)
-        _point_equations(
-            tree.parents, tree.dof_start, tree.chain, tree.depth, tree.prismatic, tree.axes, tree.rest,
-            points.segments, rest, x, weight, loss.kind, loss.scale, roots, angles, C, g, costs,
-        )  # fmt: skip
-        return C, g, costs
-
-    return make

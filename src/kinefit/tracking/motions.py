@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -21,7 +21,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.border import Border
 from kinefit.smoothing.online.fixed_lag import FixedLag
 from kinefit.smoothing.online.lag_frame import KnownNoise, TrackerView
-from kinefit.smoothing.sensor_noise import other_noise
+from kinefit.smoothing.sensor_noise import noise_of_sensors
 from kinefit.smoothing.shape_errors import shape_errors
 from kinefit.smoothing.smoother import as_tracked, smooth_results
 from kinefit.smoothing.spool import STRETCH, Spool
@@ -74,7 +74,7 @@ def motion_of(
     smooth, lag, eye = how.smooth, how.lag, how.eye
     provenance: dict[str, Any] = dict(more or {})
     shared = None
-    matched: Sequence[tuple[Matched, ...]] | None = None  # of all sensors but the keypoints
+    matched: Sequence[tuple[Matched, ...]] | None = None  # of all sensors but keypoints and packed markers
     if smooth:
         held = how.contacts or eye is not None or not how.level
         border = next(filter(None, map(Border.of, found)), None)
@@ -96,7 +96,10 @@ def motion_of(
         if take.others is not None and lag is None:
             of = take.others
             matched = Spool(of.matched(of.scene(f, take.roots, take.angles)) for f in range(len(results)))
-    others, channels = take.others, take.channels
+    others, channels, markers = take.others, take.channels, take.markers
+    packed = set(() if markers is None else markers.sensors)
+    if lag is not None and packed and matched is not None:
+        matched = Spool(tuple(m for m in several if m.sensor not in packed) for several in matched)
 
     def seen(f: int) -> tuple[Scene, list[Matched]]:
         """A frame's scene, with the body where it is when each sensor measured, and all that was matched in it."""
@@ -104,27 +107,34 @@ def motion_of(
         scene = frames.scene_of(r.state, r.time) if others is None else others.scene(f, take.roots, take.angles)
         return scene, [*r.matched, *(() if matched is None else matched[f])]
 
-    provenance["contradictions"] = contradictions(*zip(*(seen(int(f)) for f in spread(len(results), LOOKS))))
-    residuals = _residuals(len(results), seen if smooth or lag is not None else None, frames.leftovers)
+    def with_markers(f: int) -> tuple[Scene, list[Matched]]:
+        """The same, with packed markers."""
+        scene, several = seen(f)
+        return scene, several + list(() if markers is None else markers.matched(f, scene))
+
+    provenance["contradictions"] = contradictions(*zip(*(with_markers(int(f)) for f in spread(len(results), LOOKS))))
+    residuals = {} if markers is None else markers.residuals(body, take.roots, take.angles)
+    if markers is None or channels.sources or (others is not None and others.scale):
+        again = seen if smooth or lag is not None else None
+        residuals = _residuals(len(results), again, frames.leftovers, packed) | residuals
     release(channels.uv, channels.confidence, take.uv, take.confidence, weight)
     stated = {name: float(np.median(channels.sigma[channels.source == q])) for q, name in enumerate(channels.sources)}
     provenance["contradictions"] |= cameras_apart(residuals, stated)
-    noise_of_others = None
-    if others is not None and matched is not None:
-        # the tracker's own frames hold the surfaces' errors already
-        noise_of_others = other_noise(
-            body, others, matched, take.roots, take.angles, pixel_information(take, weight, shared),
-            half=round(MOTION_CORRELATION_TIME * rate), surfaces=smooth or lag is not None,
-        )  # fmt: skip
+    # the tracker's own frames hold the surfaces' errors already
+    noise_of_others = noise_of_sensors(
+        take, matched, pixel_information(take, weight, shared), half=round(MOTION_CORRELATION_TIME * rate),
+        surfaces=smooth or lag is not None,
+    )  # fmt: skip
+    if noise_of_others is not None:
         provenance["sensor noise"] = noise_of_others.summary()
 
     def weighed(f: int) -> tuple[Scene, list[Matched]]:
         """The same with keypoints as they took part."""
-        scene, several = seen(f)
+        scene, several = with_markers(f)
         pixels = {"weight": weight[f], "loss": SQUARED}
         return scene, [m if m.pixels is None else replace(m.pixels, **pixels) for m in several]
 
-    scale = None if others is None else others.scale
+    scale = take.scale
     answers = [partial(shape_errors, one, settings, weighed, scale=scale) for one in found]
     if cameras := as_record(found):
         provenance[CAMERAS] = composed(provenance.get(CAMERAS, {}), cameras)
@@ -187,15 +197,16 @@ def _behind(
 
 
 def _residuals(
-    count: int, seen: Callable[[int], tuple[Scene, list[Matched]]] | None, tracked: Sequence[tuple[Leftover, ...]]
-) -> dict[str, Residuals]:
-    """What every sensor leaves over of so many frames: as it was tracked, or of what was matched since."""
+    count: int, seen: Callable[[int], tuple[Scene, list[Matched]]] | None, tracked: Sequence[tuple[Leftover, ...]],
+    without: Collection[str] = (),
+) -> dict[str, Residuals]:  # fmt: skip
+    """Residuals of so many frames, of all sensors but some: as they were tracked, or of what was matched since."""
     remains = Remains(count)
     for f in range(count):
         if f % STRETCH == 0:
             remains.release()
         if seen is None:
-            remains.add(f, tracked[f])
+            remains.add(f, (rest for rest in tracked[f] if rest.label not in without))
             continue
         scene, matched = seen(f)
         remains.add(f, (rest for m in matched for rest in leftovers_at(m, scene)))

@@ -12,6 +12,7 @@ from kinefit.smoothing.online.fixed_lag import lag_frames
 from kinefit.smoothing.online.lag_frame import KnownNoise
 from kinefit.subject.subject import Progress, Subject
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint, TrackingInterrupted
+from kinefit.tracking.marker_steps import fit_marker_steps
 from kinefit.tracking.motions import Estimation, motion_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import run
@@ -91,7 +92,10 @@ def track(
     person = fitted_to_person(
         recording, body, settings, subject=known, trial=trial, height=height, frames=shape_frames, progress=progress
     )
-    tracked = run(
+    fitted = None
+    if smooth and lag is None and person.start is None and not person.poses:  # else a frame must know of no later one
+        fitted = fit_marker_steps(person.recording, person.subject.body, settings, progress=progress)
+    tracked = fitted or run(
         person.recording, person.subject.body, settings, start=person.start, values=person.values,
         view_bias=person.subject.view_bias, poses=person.poses, progress=progress, checkpoint=checkpoint,
     )  # fmt: skip

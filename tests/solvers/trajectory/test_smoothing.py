@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -335,3 +337,29 @@ def test_shares_leave_what_nothing_observes_its_variance():
     density = np.abs((1 - z) * (1 - p.keep[0] * z) * (1 - p.keep[1] * z)) ** 2
     for w, variance in zip(found, wanted):
         assert np.trapezoid(1.0 / (w + density), theta) / np.pi == pytest.approx(variance, rel=1e-3)
+
+
+def test_the_gradient_of_points_in_metres_is_that_of_their_robust_cost():
+    """Markers with a loss, one of them far off, and contacts without."""
+    random, count = np.random.default_rng(3), 6
+    roots, angles = random_states(2, 0.2)
+    points = BODY.landmarks.select(BODY.landmarks.names[: count + 2])
+    places = BODY.trajectories(roots, angles, points) + random.normal(0.0, 0.03, (2, count + 2, 3))
+    places[0, 1] += 0.4
+    weight = np.full((2, count + 2), 1.0 / 0.02**2)
+    weight[1, 2] = 0.0
+    seen = SeenPoints.in_metres(points, places, weight, geman_mcclure(3.0))
+    for robust in (count + 2, count):
+        equations = replace(seen, robust=robust).equations(BODY)
+        _, g, _ = equations(roots, angles)
+        assert np.abs(g).max() > 1.0
+        for k in range(N):
+            costs = []
+            for sign in (1.0, -1.0):
+                step = sign * 1e-6 * np.eye(N)[k]
+                moved = [BodyState(T, q).retract(step) for T, q in zip(roots, angles, strict=True)]
+                at = np.stack([s.T_world_root for s in moved]), np.stack([s.angles for s in moved])
+                costs.append(equations(*at)[2])
+            np.testing.assert_allclose(-2.0 * g[:, k], (costs[0] - costs[1]) / 2e-6, rtol=1e-5, atol=2e-2)
+    all_robust = seen.equations(BODY)(roots, angles)[2]
+    assert replace(seen, robust=0).equations(BODY)(roots, angles)[2][0] > all_robust[0] + 100.0

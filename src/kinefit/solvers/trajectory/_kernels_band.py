@@ -171,3 +171,46 @@ def back_substitute(W, below, x):
                 v += W[t, i, j] * x[t, j]
             z[i] = v
         x[t] = z
+
+
+@jit
+def covariance_blocks(W, below, past, since, frames, following, variance):
+    """Blocks of the inverse of a factored system, from its last frame back to frame `since`.
+
+    frames (T, n, n) are the covariances of single frames, following (T - 1, n, n) those of each frame's successor
+    (rows) with it (columns), variance (T - 1, n) those of the changes r_s that past (T - 1, 2) defines.
+    """
+    T, p, n = W.shape[0], W.shape[1], frames.shape[1]
+    ahead, next_ahead = np.zeros((3 * p, 3 * p)), np.zeros((3 * p, 3 * p))  # covariance of frames t + 1 .. t + 3
+    WT, fall, cross, own = np.empty((p, p)), np.empty((3 * p, p)), np.empty((3 * p, p)), np.empty((p, p))
+    both, line, part = np.empty((4 * p, p)), np.empty((p, 4 * p)), np.empty(4)
+    for t in range(T - 1, since - 1, -1):
+        WT[:] = W[t].T
+        product(below[t], WT, fall)
+        product(ahead, fall, cross)
+        both[:p], both[p:] = WT, -cross
+        line[:, :p], line[:, p:] = W[t], -fall.T
+        product(line, both, own)
+        next_ahead[p:, p:] = ahead[: 2 * p, : 2 * p]
+        for i in range(p):
+            for j in range(p):
+                next_ahead[i, j] = 0.5 * (own[i, j] + own[j, i])
+        next_ahead[p:, :p], next_ahead[:p, p:] = -cross[: 2 * p], -cross[: 2 * p].T
+        frames[t] = next_ahead[:n, :n]
+        if t + 1 < T:
+            following[t] = -cross[:n, :n]
+        for change in range(t + 2 if t > 0 else 0, min(t + 3, T - 1)):
+            back = min(change, 2)
+            part[:] = 0.0
+            part[1 + back], part[back] = 1.0, -1.0
+            for i in range(back):
+                part[back - i] -= past[change, i]
+                part[back - 1 - i] += past[change, i]
+            for k in range(n):
+                total = part[0] * part[0] * next_ahead[k, k]
+                for a in range(1, 4):
+                    total -= 2.0 * part[0] * part[a] * cross[(a - 1) * p + k, k]
+                    for b in range(1, 4):
+                        total += part[a] * part[b] * ahead[(a - 1) * p + k, (b - 1) * p + k]
+                variance[change, k] = max(total, 0.0)
+        ahead, next_ahead = next_ahead, ahead

@@ -21,17 +21,19 @@ from kinefit.solvers.trajectory._kernels_shared import take_out, without_shift
 
 @jit
 def pixel_equations(
-    roots, angles, owner, rest, cameras, camera, uv, weight, anchor_owner, anchor_rest, anchors, anchor_weight,
-    member, shared, kind, scale, parents, dof_start, prismatic, axes, rest_joints, chain, depth, C, g, cost,
+    roots, angles, owner, rest, cameras, camera, uv, weight, placed_owner, placed_rest, places, place_weight, robust,
+    place_kind, place_scale, member, shared, kind, scale, parents, dof_start, prismatic, axes, rest_joints, chain,
+    depth, C, g, cost,
 ):  # fmt: skip
     """Normal equations C (F, n, m) packed, g (F, n), cost (F,) of all frames at roots (F, 4, 4), angles (F, D).
 
     uv (F, K, 2) [px], weight (F, K) [1/px²] of points owner (K,), rest (K, 3) seen by camera (K,); and points
-    anchor_owner (P,), anchor_rest (P, 3) that should lie at anchors (F, P, 3) [m], anchor_weight (F, P) [1/m²].
+    placed_owner (P,), placed_rest (P, 3) that should lie at places (F, P, 3) [m], place_weight (F, P) [1/m²], of which
+    the first `robust` have a loss place_kind, place_scale, and the others none.
     member (K,) is the group of a point, -1 for none, and shared (G,) [px²] the variance of the group's common shift,
     independent in every frame; see `_kernels_shared`.
     """
-    size = 2 * owner.size + 3 * anchor_owner.size
+    size = 2 * owner.size + 3 * placed_owner.size
     data, segment, group = np.empty((8, size)), np.empty(size, np.int64), np.empty(size, np.int64)
     factor, blocks = np.empty(size), np.empty((parents.size, 27))
     frames, screws = np.empty((parents.size, 12)), np.empty((axes.shape[0], 6))
@@ -43,12 +45,16 @@ def pixel_equations(
         of_shifts = 0.0
         if shared.size > 0:
             of_shifts = without_shift(data, group, count, weight[t], member, shared, kind, scale, shift, information)
+        of_shifts += weigh(data, group, count, kind, scale, factor)
         count = point_rows(
-            frames, anchor_owner, anchor_rest, anchors[t], anchor_weight[t], data, segment, group, count
+            frames, placed_owner, placed_rest, places[t], place_weight[t], data, segment, group, count
         )  # fmt: skip
         for i in range(first, count):
-            group[i] = -1  # a contact is never an outlier
-        cost[t] = of_shifts + weigh(data, group, count, kind, scale, factor)
+            if group[i] >= robust:
+                group[i] = -1
+        cost[t] = of_shifts + weigh(
+            data[:, first:], group[first:], count - first, place_kind, place_scale, factor[first:]
+        )  # fmt: skip
         blocks[:] = 0.0
         accumulate(data, segment, factor, count, roots[t, 0, 3], roots[t, 1, 3], roots[t, 2, 3], blocks)
         if shared.size > 0:

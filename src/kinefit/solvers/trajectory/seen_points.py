@@ -1,4 +1,4 @@
-"""Normal equations of all frames of a take from keypoints and foot contacts."""
+"""Normal equations of all frames of a take from points in pixels and points in metres."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NO_POINTS = PointSet((), np.empty(0, np.int64), np.empty((0, 3)))
 
 @dataclass(frozen=True, eq=False)
 class SeenPoints:
-    """Pixels of points of a body in every frame of a take, and contacts.
+    """Points of a body in every frame of a take: in pixels (keypoints) and in metres (markers, foot contacts).
 
     Parameters
     ----------
@@ -27,8 +27,9 @@ class SeenPoints:
     uv : (T, K, 2) [px], ignored where weight is 0
     weight : (T, K) [1/px²], 0 where undetected
     loss : Loss of a pixel, in standard deviations
-    anchored : PointSet of P points with contacts
-    anchors, anchor_weight : (T, P, 3) [m] places of the contacts, and (T, P) [1/m²], 0 without contact
+    placed : PointSet of P points in metres
+    places, place_weight : (T, P, 3) [m], ignored where the weight (T, P) [1/m²] is 0; None for no points
+    place_loss, robust : Loss of the first `robust` points in metres; the others are never outliers
     member, shared : (K,) int, group of points of one segment with a common shift, -1 for none; and (G,) [px²] variance
         of each group's shift, independent in every frame
     """
@@ -39,29 +40,41 @@ class SeenPoints:
     uv: NDArray
     weight: NDArray
     loss: Loss = SQUARED
-    anchored: PointSet = field(default_factory=lambda: NO_POINTS)
-    anchors: NDArray | None = None
-    anchor_weight: NDArray | None = None
+    placed: PointSet = field(default_factory=lambda: NO_POINTS)
+    places: NDArray | None = None
+    place_weight: NDArray | None = None
+    place_loss: Loss = SQUARED
+    robust: int = 0
     member: NDArray | None = None
     shared: NDArray | None = None
+
+    @classmethod
+    def in_metres(cls, points: PointSet, places: NDArray, weight: NDArray, loss: Loss = SQUARED) -> SeenPoints:
+        """Points in metres alone, all with one loss: places (T, K, 3) [m], weight (T, K) [1/m²]."""
+        none = np.zeros(0, np.int64), np.zeros((len(places), 0, 2)), np.zeros((len(places), 0))
+        return cls(
+            Rig(()), NO_POINTS, *none, placed=points, places=places, place_weight=weight, place_loss=loss,
+            robust=len(points),
+        )  # fmt: skip
 
     def equations(self, body: Body) -> MakeEquations:
         """Equations for `trajectory.smoothing.smooth`."""
         tree = body.tree
         T, n = len(self.uv), tree.n_dofs
         uv, weight = np.ascontiguousarray(np.nan_to_num(self.uv)), np.ascontiguousarray(self.weight)
-        anchors = np.zeros((T, len(self.anchored), 3)) if self.anchors is None else self.anchors
-        anchor_weight = np.zeros(anchors.shape[:2]) if self.anchor_weight is None else self.anchor_weight
+        places = np.zeros((T, len(self.placed), 3)) if self.places is None else np.ascontiguousarray(self.places)
+        place_weight = np.zeros(places.shape[:2]) if self.place_weight is None else self.place_weight
         member = np.full(len(self.points), -1) if self.member is None else self.member
         shared = np.zeros(0) if self.shared is None else self.shared
-        rest, anchor_rest = body.points_rest(self.points), body.points_rest(self.anchored)
+        rest, placed_rest = body.points_rest(self.points), body.points_rest(self.placed)
 
         def make(roots: NDArray, angles: NDArray) -> Equations:
             C, g, cost = np.zeros((T, *tree.chain.shape)), np.empty((T, n)), np.empty(T)
             _kernels_smoothing.pixel_equations(
                 roots, angles, self.points.segments, rest, self.rig.packed, self.camera, uv, weight,
-                self.anchored.segments, anchor_rest, anchors, anchor_weight, member, shared, self.loss.kind,
-                self.loss.scale, tree.parents, tree.dof_start, tree.prismatic, tree.axes, tree.rest, tree.chain,
+                self.placed.segments, placed_rest, places, np.ascontiguousarray(place_weight), self.robust,
+                self.place_loss.kind, float(self.place_loss.scale), member, shared, self.loss.kind,
+                float(self.loss.scale), tree.parents, tree.dof_start, tree.prismatic, tree.axes, tree.rest, tree.chain,
                 tree.depth, C, g, cost,
             )  # fmt: skip
             return C, g, cost

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body
+from kinefit.bodies import Body, KinematicTree
 from kinefit.errors import ObservationError
 from kinefit.solvers._kernels_linear import LEAST_DAMPING, adapt
 from kinefit.solvers.equations import dense_pattern
@@ -192,11 +192,16 @@ def responses(body: Body, smoothed: Smoothed, B: NDArray) -> NDArray:
 def _made_dense(body: Body, equations: MakeEquations) -> MakeEquations:
     def dense(roots: NDArray, angles: NDArray) -> Equations:
         packed, g, cost = equations(roots, angles)
-        C = np.zeros((*g.shape, g.shape[1]))
-        _kernels_smoothing.add_packed(packed, body.tree.chain, body.tree.depth, C)
-        return C, g, cost
+        return unpacked(packed, body.tree), g, cost
 
     return dense
+
+
+def unpacked(packed: NDArray, tree: KinematicTree) -> NDArray:
+    """Symmetric (T, n, n) of matrices (T, n, m) that are packed along the tree."""
+    out = np.zeros((*packed.shape[:2], tree.n_dofs))
+    _kernels_smoothing.add_packed(packed, tree.chain, tree.depth, out)
+    return out + np.tril(out, -1).transpose(0, 2, 1)
 
 
 def _workspace(T: int, n: int) -> tuple[NDArray, NDArray, NDArray]:
@@ -256,23 +261,7 @@ def posterior(body: Body, smoothed: Smoothed, since: int = 0, share: NDArray | N
     frames, following = np.full((T, n, n), np.nan), np.full((max(T - 1, 0), n, n), np.nan)
     past, _ = prior.rows(max(T - 1, 0))
     variance = np.zeros((max(T - 1, 0), n))
-    ahead = np.zeros((4 * p, 4 * p))  # covariance of frames t .. t + 3
-    fall, cross, both, own = np.empty((3 * p, p)), np.empty((3 * p, p)), np.empty((4 * p, p)), np.empty((p, p))
-    for t in range(T - 1, since - 1, -1):
-        ahead[p:, p:] = ahead[: 3 * p, : 3 * p].copy()
-        _kernels_band.product(below[t], np.ascontiguousarray(W[t].T), fall)
-        _kernels_band.product(np.ascontiguousarray(ahead[p:, p:]), fall, cross)
-        cross *= -1.0
-        both[:p], both[p:] = W[t].T, cross
-        _kernels_band.product(np.concatenate([W[t], -fall.T], axis=1), both, own)
-        ahead[:p, :p], ahead[p:, :p], ahead[:p, p:] = 0.5 * (own + own.T), cross, cross.T
-        frames[t] = ahead[:n, :n]
-        if t + 1 < T:
-            following[t] = cross[:n, :n]
-        alone = np.einsum("aibi->abi", ahead.reshape(4, p, 4, p))[:, :, :n]
-        for change in {t + 2} | ({0, 1} if t == 0 else set()):
-            if change < T - 1:
-                variance[change] = _variance_of(past[change], min(change, 2), alone)
+    _kernels_band.covariance_blocks(W, below, past, since, frames, following, variance)
     return Posterior(frames, following, variance, -2.0 * float(np.log(np.einsum("tii->ti", W)[:, :n]).sum()))
 
 
@@ -283,14 +272,3 @@ def _add_posture(C: NDArray, weight: NDArray, depth: NDArray) -> None:
         C[:, 6:, 6:] += weight
     else:
         C[:, np.arange(6, n), depth[6:]] += np.diag(weight)
-
-
-def _variance_of(past: NDArray, back: int, alone: NDArray) -> NDArray:
-    """Variance (n,) of r from covariances (4, 4, n) of each degree of freedom, for small rotations of the root."""
-    newest = 1 + back
-    part = np.zeros(4)
-    part[newest], part[newest - 1] = 1.0, -1.0
-    for i in range(back):
-        part[newest - 1 - i] -= past[i]
-        part[newest - 2 - i] += past[i]
-    return np.maximum(np.einsum("a,abi,b->i", part, alone, part), 0.0)
