@@ -443,4 +443,4 @@ def test_outlines_are_made_where_a_take_follows_them_and_missing_ones_are_told(t
         load_observations(read_take(take))
     with_detections(read_take(take))
     assert read_detections(detections_file(take, "cam01")).mask(5, 0).any()
-    assert len(load_observations(read_take(take)).silhouettes) == 1
+    assert len(load_observations(read_take(take)).of_kind("silhouette")) == 1

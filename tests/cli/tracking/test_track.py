@@ -74,7 +74,7 @@ def test_faults_of_the_inputs_stand_on_top_of_summary_and_report(take, tmp_path,
     assert told.stdout.index("fault: ") < told.stdout.index("median residual")
     page = (out / "report.html").read_text(encoding="utf-8")
     assert page.index("Faults of the inputs") < page.index("the calibration&#x27;s unit or scale is wrong")
-    assert page.index("the calibration&#x27;s unit or scale is wrong") < page.index("How far every joint moved")
+    assert page.index("the calibration&#x27;s unit or scale is wrong") < page.index("In short")
     assert kinefit.read_motion(out / "motion.npz").provenance["findings"][0]["kind"] == "scale"
 
 

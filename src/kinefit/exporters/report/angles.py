@@ -251,8 +251,8 @@ def _cells(found: Extremes | None) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class Range:
-    """Range of motion of one angle on both sides, or of the body's middle, each with two standard deviations [deg].
+class AngleRange:
+    """How far one angle moved on both sides, or of the body's middle, each with two standard deviations [deg].
 
     Parameters
     ----------
@@ -271,17 +271,17 @@ class Range:
         return any(span > twice for span, twice in self.sides.values())
 
 
-def all_ranges(motion: Motion) -> list[Range]:
+def all_ranges(motion: Motion) -> list[AngleRange]:
     """Ranges of all angles that were observed."""
     out = []
     for stem, of in ranges_of(motion).items():
         sides = {side: found.span for side, found in of.items() if found is not None}
         if sides:
-            out.append(Range(spoken(stem), sides, _difference(motion, of.get("left"), of.get("right"))))
+            out.append(AngleRange(spoken(stem), sides, _difference(motion, of.get("left"), of.get("right"))))
     return out
 
 
-def short_table(found: Sequence[Range]) -> p.Html:
+def short_table(found: Sequence[AngleRange]) -> p.Html:
     """Ranges, left beside right, and their difference."""
     cells = [
         [with_error(*pair) if pair else "" for pair in (*map(one.sides.get, ("left", "right", "")), one.difference)]
@@ -293,7 +293,7 @@ def short_table(found: Sequence[Range]) -> p.Html:
 
 
 def _difference(motion: Motion, left: Extremes | None, right: Extremes | None) -> tuple[float, float] | None:
-    """Range of the left side minus that of the right, with two standard deviations [deg]."""
+    """AngleRange of the left side minus that of the right, with two standard deviations [deg]."""
     if left is None or right is None or left.coordinate is None or right.coordinate is None:
         return None
     frames, coordinates = zip(*((f, side.coordinate) for side in (left, right) for f in side.ends[::-1]))

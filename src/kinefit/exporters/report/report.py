@@ -21,7 +21,7 @@ from kinefit._files import write_text
 from kinefit.errors import ExportError, choices
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.angles import (
-    Range,
+    AngleRange,
     all_ranges,
     cycle_plots,
     joint_plots,
@@ -207,7 +207,7 @@ def _trust(motion: Motion, moments: Sequence[Moment]) -> tuple[str, str]:
     return severity if motion.residuals else "note", p.joined(*parts)
 
 
-def _moved_most(sure: Sequence[Range]) -> str:
+def _moved_most(sure: Sequence[AngleRange]) -> str:
     """The three largest ranges of those that are twice their error bars."""
     each = [(span, f"{side} {one.name}".strip(), twice) for one in sure for side, (span, twice) in one.sides.items()]
     most = sorted((one for one in each if one[0] > 2.0 * one[2]), reverse=True)[:3]
@@ -216,7 +216,7 @@ def _moved_most(sure: Sequence[Range]) -> str:
     return listed([f"{name} ({with_error(span, twice)}°)" for span, name, twice in most]) + "."
 
 
-def _sides(found: Sequence[Range]) -> str:
+def _sides(found: Sequence[AngleRange]) -> str:
     """Ranges of left and right that differ by more than the error bar."""
     differ = [(one.name, one.difference) for one in found if one.difference is not None]
     apart = [(name, pair) for name, pair in differ if abs(pair[0]) > pair[1]]
