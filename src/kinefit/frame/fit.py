@@ -27,8 +27,9 @@ from kinefit.frame.trust import (
     without_segments,
 )
 from kinefit.rows import AnyRows, Rows, weaker
-from kinefit.sensors.base import Matched, Measurement, matched_by, pixels_of, rows_at
+from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.points.keypoints import KeypointMatched, pixels_of
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.closed import closed_step, on_null_space
@@ -275,7 +276,7 @@ class FrameFit:
             return seen
         short = seen[6:] & ~moves_keypoints(scene, pixels) & ~looped(self.body)
         if short.any():
-            others = [k for k, m in enumerate(matched) if m.pixels is None]
+            others = [k for k, m in enumerate(matched) if not isinstance(m, KeypointMatched)]
             if others:
                 off = without and [without[k] for k in others]
                 rows = self.rows(scene, None, [matched[k] for k in others], without=off)

@@ -14,11 +14,11 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,12 +28,8 @@ from kinefit.errors import ObservationError
 from kinefit.rows import AnyRows, DofRows, PairRows, ParameterRows, Rows, less_sure
 from kinefit.sensors import _kernels
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence
-from kinefit.sensors.scene import Scene
-from kinefit.sensors.surfaces.depth_view import DepthView
-
-if TYPE_CHECKING:
-    from kinefit.sensors.points.keypoints import KeypointMatched
-    from kinefit.sensors.visibility.occlusion import DepthSeen
+from kinefit.sensors.scene import Scene, Unknown
+from kinefit.sensors.surfaces.depth_view import DepthSeen, DepthView
 
 
 def of_kind(value: object, kind: type, what: str, remedy: str, *, each: type | None = None) -> None:
@@ -92,19 +88,6 @@ def check_rows(rows: Any, sensor: str, body: Body) -> list[AnyRows]:
             problem = f"sensor '{sensor}' has a jacobian of {p.jacobian.shape[1]} columns; body '{body.name}' has {n}"
             raise ObservationError(problem, remedy="Give one column for each degree of freedom.")
     return list(parts)
-
-
-@dataclass(frozen=True)
-class Unknown:
-    """A sensor's own unknown, such as a rope's length, with its prior.
-
-    Parameters
-    ----------
-    mean, std : float, of the prior: in metres, radians, seconds or pixels.
-    """
-
-    mean: float
-    std: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,11 +164,6 @@ class Matched(ABC):
     turns: Mapping[int, NDArray] = MappingProxyType({})
     places: Sequence[tuple[str, str]] | None = None
     cameras: NDArray | None = None
-
-    @property
-    def pixels(self) -> KeypointMatched | None:
-        """Its image points as one packed block for compiled fits and the smoother; None if it has none."""
-        return None
 
     @property
     def key(self) -> bytes:
@@ -338,11 +316,6 @@ class RowsOf(Matched):
         """Rows as the function returns them."""
         made: AnyRows | Sequence[AnyRows] = self.make(scene, **self.about)
         return [made] if isinstance(made, AnyRows) else made
-
-
-def pixels_of(matched: Iterable[Matched]) -> list[KeypointMatched]:
-    """The packed blocks of all matches that have one; see `Matched.pixels`."""
-    return [block for m in matched if (block := m.pixels) is not None]
 
 
 def matched_by(measurement: Measurement, scene: Scene, reach: float) -> Matched:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +18,20 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.visibility.visibility import TrackedSurface
 
-if TYPE_CHECKING:
-    from kinefit.sensors.base import Measurement, Unknown
-
 SURFACE_SAMPLES = 600  # points of a body's surface that are compared with depth images
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A sensor's own unknown, such as a rope's length, with its prior.
+
+    Parameters
+    ----------
+    mean, std : float, of the prior: in metres, radians, seconds or pixels.
+    """
+
+    mean: float
+    std: float
 
 
 class Scene:
@@ -41,7 +52,7 @@ class Scene:
         Estimates of the sensors' own unknowns, such as the length of a rope; see `Unknown`.
     unknowns : {sensor: {name: Unknown}}, optional
         All of them: rows of the sensor are less sure by those without an estimate.
-    measurements : of all sensors at this time, for sensors that use each other's
+    measurements : each a `Measurement`, of all sensors at this time, for sensors that use each other's
     surface : TrackedSurface of the body, made when it is first needed
     others : scenes of other bodies at the same time
     covariance : (6 + D, 6 + D) [m, rad], optional
@@ -50,7 +61,7 @@ class Scene:
 
     def __init__(
         self, body: Body, state: BodyState, rig: Rig, *, time: float = 0.0, velocity: NDArray | None = None,
-        values: Mapping[str, Mapping[str, float]] | None = None, measurements: Sequence[Measurement] = (),
+        values: Mapping[str, Mapping[str, float]] | None = None, measurements: Sequence[Any] = (),
         surface: TrackedSurface | None = None, others: Sequence[Scene] = (), samples: int = SURFACE_SAMPLES,
         covariance: NDArray | None = None, unknowns: Mapping[str, Mapping[str, Unknown]] | None = None,
     ) -> None:  # fmt: skip

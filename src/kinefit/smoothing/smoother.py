@@ -17,8 +17,9 @@ from kinefit.correspondences.closures import hard_equations, looped
 from kinefit.findings import runs_of
 from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult, frame_result, frame_results
 from kinefit.frame.trust import unknown_joints
-from kinefit.sensors.base import Matched, pixels_of
+from kinefit.sensors.base import Matched
 from kinefit.sensors.evidence import moves_points, near
+from kinefit.sensors.points.keypoints import pixels_of
 from kinefit.sensors.points.views import find_swaps, limb_groups
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.border import Border, with_border

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from kinefit._mapped import release, room
 from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
-from kinefit.sensors.base import Leftover, Measurement, pixels_of
+from kinefit.sensors.base import Leftover, Measurement
 from kinefit.sensors.channels import Channels
+from kinefit.sensors.points.keypoints import pixels_of
 from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.sensors.points.views import beside, trunks
 from kinefit.sensors.settings import TrackSettings

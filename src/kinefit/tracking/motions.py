@@ -15,7 +15,8 @@ from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
 from kinefit.losses import SQUARED
 from kinefit.motion import Motion, Residuals
-from kinefit.sensors.base import Leftover, Matched, leftovers_at, pixels_of
+from kinefit.sensors.base import Leftover, Matched, leftovers_at
+from kinefit.sensors.points.keypoints import KeypointMatched, pixels_of
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.border import Border
@@ -132,7 +133,7 @@ def motion_of(
         """The same with keypoints as they took part."""
         scene, several = with_markers(f)
         pixels = {"weight": weight[f], "loss": SQUARED}
-        return scene, [m if m.pixels is None else replace(m.pixels, **pixels) for m in several]
+        return scene, [replace(m, **pixels) if isinstance(m, KeypointMatched) else m for m in several]
 
     scale = take.scale
     answers = [partial(shape_errors, one, settings, weighed, scale=scale) for one in found]
@@ -185,7 +186,7 @@ def _behind(
 
     def take(late: list[FrameResult]) -> None:
         for r in late:
-            matched.append(tuple(m for m in r.matched if m.pixels is None))
+            matched.append(tuple(m for m in r.matched if not isinstance(m, KeypointMatched)))
             out.append(replace(r, matched=tuple(pixels_of(r.matched)), measurements=()))
 
     for result, measurements in zip(frames.results, frames.measurements):

@@ -14,8 +14,8 @@ from kinefit.errors import ObservationError, choices
 from kinefit.frame.results import FrameResult
 from kinefit.motion import UP_AXES
 from kinefit.observations.arrays import numbers
-from kinefit.sensors.base import Leftover, Measurement, leftovers_at, pixels_of
-from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement, Layout
+from kinefit.sensors.base import Leftover, Measurement, leftovers_at
+from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement, Layout, pixels_of
 from kinefit.sensors.scene import Scene
 from kinefit.smoothing.linearised import ApartRows, SceneOf
 from kinefit.smoothing.spool import Spool

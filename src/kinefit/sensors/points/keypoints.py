@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -302,11 +302,6 @@ class KeypointMatched(Matched):
     sensor = KEYPOINTS
 
     @property
-    def pixels(self) -> KeypointMatched:
-        """Itself."""
-        return self
-
-    @property
     def places(self) -> Sequence[tuple[str, str]] | None:  # type: ignore[override]
         """Of every channel; None where other rows than those of pixels take part."""
         return None if self.hidden else self.measurement.layout.places
@@ -421,5 +416,10 @@ def keypoint_sigma(keypoints: Sequence[Keypoints], sigma: Mapping[str, float], d
 
 def packed(matched: Sequence[Matched], scene: Scene) -> PixelPoints | None:
     """The points of a scene's only match for a fit in one compiled piece; None where rows are needed."""
-    one = matched[0].pixels if len(matched) == 1 else None
+    one = next(iter(pixels_of(matched)), None) if len(matched) == 1 else None
     return None if one is None or scene.at_time(one.time) is not scene else one.packed(scene)
+
+
+def pixels_of(matched: Iterable[Matched]) -> list[KeypointMatched]:
+    """The matches of image points: packed blocks for compiled fits and the smoother."""
+    return [m for m in matched if isinstance(m, KeypointMatched)]

@@ -22,9 +22,9 @@ from kinefit.sensors.evidence import AGREEMENT_SIGMAS, Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surfaces import _kernels_depth_view as kernels
-from kinefit.sensors.surfaces.depth_view import Background, DepthView, view_of
+from kinefit.sensors.surfaces.depth_view import Background, DepthSeen, DepthView, view_of
 from kinefit.sensors.surfaces.point_cloud import FreePairs, SurfacePairs, along
-from kinefit.sensors.visibility.occlusion import DepthSeen, drawn_together, of_others
+from kinefit.sensors.visibility.occlusion import drawn_together, of_others
 from kinefit.sensors.visibility.visibility import judge_segments
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,6 +15,14 @@ from kinefit.sensors.surfaces import _kernels_depth_view as kernels
 _CLOUD_FOCAL_PX = 300.0  # of the virtual camera that renders a cloud
 _MAX_NEIGHBOUR_DISTANCE = 0.10  # [m] of adjacent pixels of one surface: less than from an arm to the trunk behind it
 UNMEASURED_TRUST = 0.5  # that a pixel without a measurement is empty: background out of range, or a hole
+
+
+class DepthSeen(NamedTuple):
+    """A depth image for occlusion tests of other sensors: (H, W) [m], its camera, its standard deviation [m]."""
+
+    depth: NDArray
+    camera: Camera
+    sigma: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,20 +14,13 @@ from kinefit.geometry.camera import Camera
 from kinefit.observations import DepthFrame
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.scene import Scene
+from kinefit.sensors.surfaces.depth_view import DepthSeen
 
 MIN_VISIBLE_CONFIDENCE = 0.8  # from which a keypoint counts as visible; detectors give occluded points less
 MAX_VIEW_ANGLE = np.radians(10.0)  # between two cameras' views of the body: 0.5 m behind a hand they are 9 cm apart
 MIN_OCCLUDED_DEPTH = 0.15  # [m] below the skin: deeper than any joint, less than a trunk is thick
 _JOINT_DEPTH = 0.05  # [m] of a joint below the skin, and its standard deviation
 _MEDIAN_RADIUS_PX = 1  # of the pixels about a keypoint whose median depth counts
-
-
-class DepthSeen(NamedTuple):
-    """A depth image for occlusion tests of other sensors: (H, W) [m], its camera, its standard deviation [m]."""
-
-    depth: NDArray
-    camera: Camera
-    sigma: float
 
 
 @dataclass(frozen=True, eq=False)

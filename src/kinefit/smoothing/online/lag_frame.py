@@ -15,10 +15,10 @@ from kinefit.errors import ObservationError
 from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult
 from kinefit.rows import AnyRows
-from kinefit.sensors.base import Matched, Measurement, matched_by, pixels_of
+from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.evidence import moves_points
-from kinefit.sensors.points.keypoints import KeypointMatched
+from kinefit.sensors.points.keypoints import KeypointMatched, pixels_of
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.linearised import ApartRows, SceneOf
@@ -108,7 +108,7 @@ class FrameCosts:
         """(D,) bool: coordinates that a frame observes on its own."""
         frame, scene, tree = frames[f], self.scene(frames, f), self.body.tree
         pixels = pixels_of(frame.points)
-        others = [m for m in (*frame.points, *frame.surfaces) if m.pixels is None]
+        others = [m for m in (*frame.points, *frame.surfaces) if not isinstance(m, KeypointMatched)]
         observed = np.zeros(len(tree.coordinates), bool)
         H = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
         closed = every_closure(self.body, scene.state)
@@ -143,7 +143,7 @@ class FrameCosts:
 
     def _rows(self, matched: Sequence[Matched], scene: Scene, points: Sequence[Matched] = ()) -> list[AnyRows]:
         """Rows of matches; `points` are all matches of points of the frame, which decide how surfaces count."""
-        weighted = [m if m.pixels is None else self._with_known_noise(m.pixels) for m in matched]
+        weighted = [self._with_known_noise(m) if isinstance(m, KeypointMatched) else m for m in matched]
         count = rows_of_points(scene, [m for m in points if m not in matched])
         return rows_of(scene, weighted, self.tracker.settings, self.noise.scale, points=count)
 
