@@ -142,6 +142,7 @@ class Matched(ABC):
     Attributes
     ----------
     sensor, time : name of the sensor, and when [s] it measured; those of the measurement where they are not set
+    added : variances that unknowns of the sensor add to each part of its rows, once they are computed
     of_points : whether rows are single points with independent errors; else the rows of one segment err alike.
     shows_surface : whether it shows a surface as a whole, so that a missing surface contradicts the body.
     lasts : share 0..1 of a point's stated variance that is systematic, and so does not average out over time
@@ -156,6 +157,7 @@ class Matched(ABC):
 
     sensor: str = ""
     time: float = np.nan
+    added: Sequence[NDArray] | None = None
     of_points: bool = True
     shows_surface: bool = False
     lasts: float = 0.0
@@ -343,7 +345,7 @@ def rows_at(matched: Matched, scene: Scene) -> Sequence[AnyRows]:
 
 
 def felt(matched: Matched, scene: Scene, *, check: bool = False) -> Sequence[AnyRows]:
-    """Rows of a match; unknowns of its sensor that have no estimate add their variance to each.
+    """Rows of a match; unknowns of its sensor that have no estimate add their variance, where it was matched, to each.
 
     Parameters
     ----------
@@ -355,12 +357,17 @@ def felt(matched: Matched, scene: Scene, *, check: bool = False) -> Sequence[Any
         return check_rows(rows, matched.sensor, scene.body) if check else rows
 
     rows, known = made(scene), scene.values.get(matched.sensor, {})
-    for name, unknown in scene.unknowns.get(matched.sensor, {}).items():
-        if name not in known:
+    open_ones = {name: u for name, u in scene.unknowns.get(matched.sensor, {}).items() if name not in known}
+    if not open_ones:
+        return rows
+    if matched.added is None:
+        added = [np.zeros(len(part)) for part in rows]
+        for name, unknown in open_ones.items():
             values = {**scene.values, matched.sensor: {**known, name: unknown.mean + unknown.std}}
             moved = made(scene.at(scene.state, values=values))
-            rows = [less_sure(a, np.square(b.residual - a.residual)) for a, b in zip(rows, moved, strict=True)]
-    return rows
+            added = [v + np.square(b.residual - a.residual) for v, a, b in zip(added, rows, moved, strict=True)]
+        object.__setattr__(matched, "added", added)
+    return [less_sure(part, v) for part, v in zip(rows, matched.added or (), strict=True)]
 
 
 def leftovers_at(matched: Matched, scene: Scene) -> list[Leftover]:

@@ -34,7 +34,8 @@ from kinefit.tracking.recording import Recording
 
 _ONE_CAMERA = 0.02  # [m] how far a detector's points stand from their places, for one camera: with 0, 5, 10, 20 mm each
 # camera of the balancing trial has joints 76, 70, 69 and 66 mm off and 79, 83, 89 and 95 % inside, in the worst axis
-_START_ROUNDS = 20  # of reweighted least squares, which then change the start by less than a standard deviation
+_START_ROUNDS = 20  # of reweighted least squares, at most ...
+_START_SIGMAS = 0.1  # ... and fewer once a round changes the start by less than this share of its standard deviation
 _SEAT = 0.01  # [m] how far a marker of the body's own set sits from its place on a person: as a detector's points
 
 
@@ -183,7 +184,10 @@ def _start_of(
             at = frame_at(frames, theta, f, state, Weighing())
             J = D * (at.used / np.maximum(np.abs(at.residual), 1.0))[:, None]
             H, g = H + D.T @ J, g + J.T @ at.residual
-        theta = theta + np.linalg.solve(H, g)
+        step = np.linalg.solve(H, g)
+        theta = theta + step
+        if step @ H @ step < _START_SIGMAS**2 * len(step):
+            break
     return theta
 
 
