@@ -383,7 +383,7 @@ TABLES: dict[str, type[Any]] = {
     "camera": CameraEntry, "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry,
     "stereo": StereoEntry,
 }  # fmt: skip
-"""Tables of a take file without those of `SensorKind`s, and their keys as the fields of a record."""
+"""Tables of a take file but those of each `SensorKind`, and their keys as the fields of a record."""
 ATTRIBUTES = {"start": "placed", "camera": "cameras"}
 """{table: attribute of a `Take`} where they differ; the keys of [take] are attributes themselves."""
 SINGLE_TABLES = ("take", "session", "start", "calibration")
