@@ -80,28 +80,33 @@ def with_border(
     border : to start from
     window, overlap : numbers of frames
     """
+    others, prior = take.others, border.unknowns.information
+    assert others is not None
     for _ in range(_ROUNDS):
+        take = replace(take, others=with_values(others, border.values))
         take, S, b = _reduced(take, strength, border, window, overlap)
-        if not S.any():
+        told = np.flatnonzero(np.diag(S) > 0.0)  # of surfaces, and of what was never felt, the subject fit knows more
+        if not len(told):
             return take, border
-        prior = border.unknowns.information
-        step = np.linalg.solve(S + prior, b + prior @ (border.unknowns.mean - border.theta))
+        own = np.ix_(told, told)
         alike = max(DETECTOR_CORRELATION_TIME / take.dt, 1.0)
-        border = replace(border, theta=border.theta + step, covariance=inverse(S / alike + prior))
-        if step @ (S / alike + prior) @ step < _MAX_CHANGE_SIGMAS**2 * len(step):
+        information, theta, covariance = (S / alike + prior)[own], border.theta.copy(), border.covariance.copy()
+        step = np.linalg.solve((S + prior)[own], (b + prior @ (border.unknowns.mean - theta))[told])
+        theta[told] += step
+        covariance[told] = covariance[:, told] = 0.0
+        covariance[own] = inverse(information)
+        border = replace(border, theta=theta, covariance=covariance)
+        if step @ information @ step < _MAX_CHANGE_SIGMAS**2 * len(step):
             break
-    assert take.others is not None
-    return replace(take, others=with_values(take.others, border.values)), border
+    return replace(take, others=with_values(others, border.values)), border
 
 
 def _reduced(
     take: SmoothTake, strength: Strength, border: Border, window: int, overlap: int
 ) -> tuple[SmoothTake, NDArray, NDArray]:
-    """The take smoothed at some values, and the equations S (p, p), b (p,) of their step, all poses eliminated."""
+    """The take smoothed at its values, and the equations S (p, p), b (p,) of their step, all poses eliminated."""
     p = len(border.theta)
     S, b, step = np.zeros((p, p)), np.zeros(p), border.unknowns.step
-    assert take.others is not None
-    take = replace(take, others=with_values(take.others, border.values))
     world, matched = World(take.body, take.channels.rig), Spool[tuple[Matched, ...]]()
     worlds, windows = Worlds(world, (border.unknowns,)), parts(len(take.roots), window, overlap)
     roots, angles, every = np.array(take.roots), np.array(take.angles), np.ones(p, bool)
