@@ -249,7 +249,7 @@ class MatchedFrames:
         same = cached is not None and cached[0] is scene.state
         if same and cached is not None and _same_for(cached[1], world, sensor, matched.shows_surface):
             return cached[2]
-        rows = rows_at(matched, scene)
+        rows = list(rows_at(matched, scene))
         if not same:
             self._latest[key] = scene.state, world, rows
         return rows

@@ -85,11 +85,11 @@ def test_yaml_that_opencv_cannot_read():
 @pytest.mark.parametrize(
     ("text", "told"),
     [("a: 1\n  b: 2", "line 2: mapping values are not allowed"), ("a: 1\na: 2", "line 2: the key 'a' appears twice"),
-     ("a: *b", "line 1: found undefined alias"), ("a: &b [1]\nc: *b", "an anchor that is used again"),
-     ("a: &b [*b]", "an anchor that is used again"), ('a: "x', "unexpected end of stream"), ("a: - b", "line 1: block"),
+     ("a: *b", "line 1: an anchor"), ("a: &b [1]\nc: *b", "line 1: an anchor"),
+     ("a:\n- &b [*b]", "line 2: an anchor"), ('a: "x', "unexpected end of stream"), ("a: - b", "line 1: block"),
      ("a: [1, {b: 2]", "line 1: did not find expected ',' or '}'"), ("a: [1", "did not find expected"),
      ("a:\n  b: 1\n c", "line 3: did not find expected key"), ("x: {[1]: 2}", "line 1: the key"),
-     ("a: " + "[" * 5000, "maximum nesting depth"), ("a: " + "[" * 900 + "]" * 900, "nested too deeply"),
+     ("a: " + "[" * 900 + "]" * 900, "nested too deeply"),
      ("a: \0", "not allowed")],
 )  # fmt: skip
 def test_broken_yaml_is_told_with_its_line(tmp_path, text, told):

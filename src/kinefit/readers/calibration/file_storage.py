@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 if TYPE_CHECKING:
-    from yaml import Node
+    from yaml import Event
 
 _NUMBER = re.compile(r"[-+]?(?:\d+(\.\d*)?|(\.\d+))([eE][-+]?\d+)?")
 _WORDS = {
@@ -18,6 +19,8 @@ _AS_OPENCV = re.compile(
     r"(?<![^{,\n])(?P<key>[ \t]*+(?:-[ \t]++)*+[A-Za-z_][\w.-]*+:)(?=[^\s:/])"
 )
 """What OpenCV writes otherwise than YAML: quotes with a backslash in texts, keys whose colon no blank follows."""
+_OPENED: dict[str, Callable[[], Any]] = {"SequenceStartEvent": list, "MappingStartEvent": dict}
+_DEEPEST = 100  # tables within tables; a calibration has five
 
 
 def parse_xml(text: str) -> ElementTree.Element:
@@ -73,8 +76,8 @@ def storage_of_yaml(text: str) -> Any:
     # Headers differ: OpenCV 4 writes "%YAML:1.0" and "---", OpenCV 5 "%YAML 1.2", people write none.
     lines = ["" if line.startswith(("%", "---", "...")) else line for line in text.splitlines()]
     try:
-        root = yaml.compose(_AS_OPENCV.sub(_as_yaml, "\n".join(lines)), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-        return None if root is None else _node(root, set())
+        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+        return _values(yaml.parse(_AS_OPENCV.sub(_as_yaml, "\n".join(lines)), loader))
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         raise ValueError(f"line {mark.line + 1}: {error.problem}" if mark else str(error.problem)) from None
@@ -88,22 +91,37 @@ def _as_yaml(found: re.Match[str]) -> str:
     return f"{found[0]} " if found["key"] else found[0]
 
 
-def _node(node: Node, read: set[int]) -> Any:
-    """The value of a node; `read`: identities of the nodes so far, as an alias leads to a node again."""
-    place = f"line {node.start_mark.line + 1}"
-    if id(node) in read:
-        raise ValueError(f"{place}: an anchor that is used again, which OpenCV does not write")
-    read.add(id(node))
-    if isinstance(node.value, str):
-        return node.value if getattr(node, "style", None) else _scalar(node.value)
-    if node.id == "sequence":
-        return [_node(item, read) for item in node.value]
-    out: dict[str, Any] = {}
-    for key, value in node.value:
-        if not isinstance(key.value, str) or key.value in out:
-            raise ValueError(f"line {key.start_mark.line + 1}: the key '{key.value}' appears twice, or is no text")
-        out[key.value] = _node(value, read)
-    return out
+def _values(events: Iterable[Event]) -> Any:
+    """Value of the document. Events, not yaml.compose: that recurses in C, and ten thousand "[" end the process."""
+    inside: list[Any] = [[]]  # what is open, the document first
+    keys: list[str | None] = [None]  # of each, the key that waits for its value
+    for event in events:
+        place, value = f"line {event.start_mark.line + 1}", getattr(event, "value", None)
+        if getattr(event, "anchor", None) is not None:
+            raise ValueError(f"{place}: an anchor, which OpenCV does not write")
+        if (opens := _OPENED.get(type(event).__name__)) is not None:
+            value = opens()
+        elif type(event).__name__ in ("SequenceEndEvent", "MappingEndEvent"):
+            inside.pop()
+            keys.pop()
+        if value is None:
+            continue
+        if isinstance(inside[-1], dict) and keys[-1] is None:
+            if not isinstance(value, str) or value in inside[-1]:
+                raise ValueError(f"{place}: the key '{value or ''}' appears twice, or is no text")
+            keys[-1] = value
+            continue
+        read = _scalar(value) if isinstance(value, str) and not getattr(event, "style", None) else value
+        if isinstance(inside[-1], dict):
+            inside[-1][keys[-1]], keys[-1] = read, None
+        else:
+            inside[-1].append(read)
+        if opens is not None:
+            inside.append(value)
+            keys.append(None)
+            if len(inside) > _DEEPEST:
+                raise ValueError(f"{place}: nested too deeply")
+    return inside[0][0] if inside[0] else None
 
 
 def _scalar(text: str) -> Any:
