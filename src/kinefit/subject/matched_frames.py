@@ -170,7 +170,7 @@ class MatchedFrames:
     ) -> None:  # fmt: skip
         self._worlds, self._steps, self._times, self._velocities = worlds, steps, times, velocities
         self._matched: list[list[Matched]] = []
-        self._latest: dict[tuple[int, int], tuple[BodyState, World, list[AnyRows]]] = {}
+        self._latest: dict[tuple[int, int], tuple[BodyState, World, Sequence[AnyRows]]] = {}
         world = worlds.at(theta)
         for f, state in enumerate(states):
             scene = self._scene(world, f, state)
@@ -243,13 +243,13 @@ class MatchedFrames:
 
     def _rows(
         self, key: tuple[int, int], sensor: str, matched: Matched, scene: Scene, world: World
-    ) -> list[AnyRows]:
+    ) -> Sequence[AnyRows]:
         """Rows of one measurement; cached rows if the world differs only in parts on which they do not depend."""
         cached = self._latest.get(key)
         same = cached is not None and cached[0] is scene.state
         if same and cached is not None and _same_for(cached[1], world, sensor, matched.shows_surface):
             return cached[2]
-        rows = list(rows_at(matched, scene))
+        rows = rows_at(matched, scene)
         if not same:
             self._latest[key] = scene.state, world, rows
         return rows

@@ -77,6 +77,7 @@ def test_yaml_by_hand_is_read_as_opencv_reads_it(text):
 def test_yaml_that_opencv_cannot_read():
     assert storage_of_yaml("%YAML:1.0\n---\na: null\n") == {"a": None}  # a text to OpenCV 4.11, not to 5.0
     assert storage_of_yaml("a:\n- 1\n- 2\n'b c': x # remark\n") == {"a": [1, 2], "b c": "x"}
+    assert storage_of_yaml("a: &b [1]\nc: &d 2\n") == {"a": [1], "c": 2}
     assert storage_of_yaml("a: |\n  x: 1\n  y\n") == {"a": "x: 1\ny"}
     assert storage_of_yaml("a: { b:1, c:'d, e:f' } # g:h\n") == {"a": {"b": 1, "c": "d, e:f"}}
     assert storage_of_yaml("a: [ 1, # one\n  2,\n]\r\nb: 1 2 3") == {"a": [1, 2], "b": "1 2 3"}
@@ -85,8 +86,8 @@ def test_yaml_that_opencv_cannot_read():
 @pytest.mark.parametrize(
     ("text", "told"),
     [("a: 1\n  b: 2", "line 2: mapping values are not allowed"), ("a: 1\na: 2", "line 2: the key 'a' appears twice"),
-     ("a: *b", "line 1: an anchor"), ("a: &b [1]\nc: *b", "line 1: an anchor"),
-     ("a:\n- &b [*b]", "line 2: an anchor"), ('a: "x', "unexpected end of stream"), ("a: - b", "line 1: block"),
+     ("a: *b", "line 1: found undefined alias"), ("a: &b [1]\nc: *b", "line 1: an anchor that is used again"),
+     ("a: &b [*b]", "an anchor that is used again"), ('a: "x', "unexpected end of stream"), ("a: - b", "line 1: block"),
      ("a: [1, {b: 2]", "line 1: did not find expected ',' or '}'"), ("a: [1", "did not find expected"),
      ("a:\n  b: 1\n c", "line 3: did not find expected key"), ("x: {[1]: 2}", "line 1: the key"),
      ("a: " + "[" * 900 + "]" * 900, "nested too deeply"),

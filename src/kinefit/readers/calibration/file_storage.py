@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterator
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
@@ -19,7 +20,6 @@ _AS_OPENCV = re.compile(
     r"(?<![^{,\n])(?P<key>[ \t]*+(?:-[ \t]++)*+[A-Za-z_][\w.-]*+:)(?=[^\s:/])"
 )
 """What OpenCV writes otherwise than YAML: quotes with a backslash in texts, keys whose colon no blank follows."""
-_OPENED: dict[str, Callable[[], Any]] = {"SequenceStartEvent": list, "MappingStartEvent": dict}
 _DEEPEST = 100  # tables within tables; a calibration has five
 
 
@@ -68,8 +68,8 @@ def _words(text: str | None) -> list[Any]:
 def storage_of_yaml(text: str) -> Any:
     """Values of OpenCV's YAML: dicts, lists, numbers, texts, None.
 
-    Tags are skipped, and no word but null and the infinities has a meaning; a repeated key and an anchor raise
-    ValueError, as all that is no YAML does.
+    Tags are skipped, and no word but null and the infinities has a meaning; a repeated key and an anchor that
+    is used raise ValueError, as all that is no YAML does.
     """
     import yaml
 
@@ -77,7 +77,11 @@ def storage_of_yaml(text: str) -> Any:
     lines = ["" if line.startswith(("%", "---", "...")) else line for line in text.splitlines()]
     try:
         loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-        return _values(yaml.parse(_AS_OPENCV.sub(_as_yaml, "\n".join(lines)), loader))
+        events = iter(yaml.parse(_AS_OPENCV.sub(_as_yaml, "\n".join(lines)), loader))
+        root = next(e for e in events if not isinstance(e, yaml.StreamStartEvent | yaml.DocumentStartEvent))
+        value = None if isinstance(root, yaml.StreamEndEvent) else _value(root, events, {})
+        list(events)  # what follows has to be YAML, too
+        return value
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         raise ValueError(f"line {mark.line + 1}: {error.problem}" if mark else str(error.problem)) from None
@@ -91,37 +95,35 @@ def _as_yaml(found: re.Match[str]) -> str:
     return f"{found[0]} " if found["key"] else found[0]
 
 
-def _values(events: Iterable[Event]) -> Any:
-    """Value of the document. Events, not yaml.compose: that recurses in C, and ten thousand "[" end the process."""
-    inside: list[Any] = [[]]  # what is open, the document first
-    keys: list[str | None] = [None]  # of each, the key that waits for its value
-    for event in events:
-        place, value = f"line {event.start_mark.line + 1}", getattr(event, "value", None)
-        if getattr(event, "anchor", None) is not None:
-            raise ValueError(f"{place}: an anchor, which OpenCV does not write")
-        if (opens := _OPENED.get(type(event).__name__)) is not None:
-            value = opens()
-        elif type(event).__name__ in ("SequenceEndEvent", "MappingEndEvent"):
-            inside.pop()
-            keys.pop()
-        if value is None:
-            continue
-        if isinstance(inside[-1], dict) and keys[-1] is None:
-            if not isinstance(value, str) or value in inside[-1]:
-                raise ValueError(f"{place}: the key '{value or ''}' appears twice, or is no text")
-            keys[-1] = value
-            continue
-        read = _scalar(value) if isinstance(value, str) and not getattr(event, "style", None) else value
-        if isinstance(inside[-1], dict):
-            inside[-1][keys[-1]], keys[-1] = read, None
-        else:
-            inside[-1].append(read)
-        if opens is not None:
-            inside.append(value)
-            keys.append(None)
-            if len(inside) > _DEEPEST:
-                raise ValueError(f"{place}: nested too deeply")
-    return inside[0][0] if inside[0] else None
+def _value(event: Event, events: Iterator[Event], anchors: dict[str, str], depth: int = 0) -> Any:
+    """The value that begins with an event; `anchors`: places by name.
+
+    Not of yaml.compose, which recurses in C: ten thousand tables within tables end the process.
+    """
+    place, kind, anchor = f"line {event.start_mark.line + 1}", type(event).__name__, getattr(event, "anchor", None)
+    if kind == "AliasEvent" and anchor in anchors:
+        raise ValueError(f"{anchors[anchor]}: an anchor that is used again, which OpenCV does not write")
+    if kind == "AliasEvent":
+        raise ValueError(f"{place}: found undefined alias '{anchor}'")
+    if anchor is not None:
+        anchors[anchor] = place
+    if kind == "ScalarEvent":
+        return event.value if getattr(event, "style", None) else _scalar(event.value)
+    if depth > _DEEPEST:
+        raise ValueError(f"{place}: nested too deeply")
+    if kind == "SequenceStartEvent":
+        return [_value(item, events, anchors, depth + 1) for item in takewhile(_goes_on, events)]
+    out: dict[str, Any] = {}
+    for key in takewhile(_goes_on, events):
+        name, place = getattr(key, "value", None), f"line {key.start_mark.line + 1}"
+        if name is None or name in out:
+            raise ValueError(f"{place}: the key '{name or ''}' appears twice, or is no text")
+        out[name] = _value(next(events), events, anchors, depth + 1)
+    return out
+
+
+def _goes_on(event: Event) -> bool:
+    return type(event).__name__ not in ("SequenceEndEvent", "MappingEndEvent")
 
 
 def _scalar(text: str) -> Any:
