@@ -1,6 +1,6 @@
 """Sensors of another distribution, installed by pip and found in a fresh process; errors name the plug-in."""
 
-import importlib
+import importlib.util
 import os
 import re
 import subprocess
@@ -55,7 +55,10 @@ class Site:
         for old, new in pairs:
             assert text.count(old) == 1, old
             text = text.replace(old, new)
-        (self.folder / "kinefit_insole.py").write_text(text)
+        file = self.folder / "kinefit_insole.py"
+        file.write_text(text)
+        # Python knows compiled code by the size and the second of its source: two changes may share both.
+        Path(importlib.util.cache_from_source(file)).unlink(missing_ok=True)
 
     def kinefit(self, *words):
         """Run a command in a fresh process that sees the folder; returns its exit code and all that it printed."""
