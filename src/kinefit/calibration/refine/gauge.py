@@ -24,7 +24,7 @@ def resized(rig: Rig, factor: float) -> Rig:
 
 
 def generators(rig: Rig) -> NDArray:
-    """(C · 10, 7) derivatives of the cameras' parameters by a twist (v, ω) and the scale of the world, images fixed."""
+    """(C · 16, 7) derivatives of the cameras' parameters by a twist (v, ω) and the scale of the world, images fixed."""
     out = np.zeros((len(rig), COLUMNS, 7))
     for block, camera in zip(out, rig, strict=True):
         block[POSE, :6] = -se3.adjoint(camera.T_camera_world)
@@ -75,9 +75,9 @@ def _by_centres(rig: Rig, old: Rig) -> tuple[NDArray, float]:
 
 
 def covariance_in_gauge(rig: Rig, S: NDArray, free: NDArray) -> NDArray:
-    """(C · 10, C · 10) covariance of the cameras' parameters in the gauge of `aligned`, from their information S.
+    """(C · 16, C · 16) covariance of the cameras' parameters in the gauge of `aligned`, from their information S.
 
-    free (C · 10,) bool: estimated parameters; all others have zero. Undetermined directions are large, not infinite.
+    free (C · 16,) bool: estimated parameters; all others have zero. Undetermined directions are large, not infinite.
     """
     G, W = generators(rig), _gauge_weight(len(rig))
     G = G * free[:, None]
