@@ -31,7 +31,8 @@ def seen(frames=15, noise=1.0):
     uv = np.concatenate([c.project(x) for c in RIG], axis=1)
     uv += noise * random.normal(size=uv.shape)
     camera, column = np.repeat(np.arange(3), len(SET)), np.tile(np.arange(len(SET)), 3)
-    return PixelFrames(SET, camera, column, uv, np.full(uv.shape[:2], max(noise, 0.5) ** -2)), states
+    weight = np.full(uv.shape[:2], max(noise, 0.5) ** -2)
+    return PixelFrames(SET, camera, column, uv, weight, np.ones(len(column)), np.zeros(uv.shape)), states
 
 
 def model():

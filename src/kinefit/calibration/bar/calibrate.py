@@ -12,7 +12,7 @@ from kinefit._arguments import checked
 from kinefit.calibration.bar.bundle import BarBundle, adjust_bar
 from kinefit.calibration.bar.placing import on_floor, place
 from kinefit.calibration.bar.report import BarCameraReport, advice_of, reports_of
-from kinefit.calibration.bar.start import MIN_PLACES, first_pairs, inlier_distance, resect
+from kinefit.calibration.bar.start import MIN_PLACES, first_pairs, inlier_distance, resect, with_focal
 from kinefit.calibration.bar.targets import BarViews
 from kinefit.calibration.board.intrinsics import known_camera
 from kinefit.errors import CalibrationError
@@ -48,7 +48,7 @@ class BarCalibration:
         Description of the origin and the vertical axis.
     advice : tuple of str
         What else to record.
-    covariance : (C, 15, C, 15), as in `BarBundle`, in the gauge of the first camera.
+    covariance : (C · 15, C · 15), as in `BarBundle`, in the gauge of the first camera.
     """
 
     rig: Rig
@@ -117,7 +117,8 @@ def calibrate_bar(
     x_world = bundle.x_world @ T_new_world[:3, :3].T + T_new_world[:3, 3]
     return BarCalibration(
         rig, length, reports, bundle.sigma, bundle.scatter, frames[used], x_world, used_uv, bundle.residuals,
-        int(ambiguous.sum()), int((~used & ~ambiguous).sum()), world, tuple(advice_of(rig, reports)), bundle.covariance,
+        int(ambiguous.sum()), int((~used & ~ambiguous).sum()), world, tuple(advice_of(rig, reports)),
+        bundle.covariance.reshape(15 * len(rig), -1),
     )
 
 
@@ -139,9 +140,7 @@ def check_cameras(names: Collection[str]) -> None:
 
 def _camera(name: str, views: BarViews, interiors: Rig | None) -> Camera:
     if interiors is None:
-        width, height = views.size
-        K = np.array([[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]])
-        return Camera(name, views.size, K, np.zeros(5))
+        return with_focal(Camera(name, views.size, np.eye(3)), 1.0, False)
     return known_camera(interiors, name, views.size)
 
 

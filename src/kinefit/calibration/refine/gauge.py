@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.solvers.bundle.cameras import COLUMNS, POSE
+from kinefit.solvers.bundle.cameras import COLUMNS, POSE, departure
 
 _PLACE_SIGMA = 0.05  # [m] of a camera's centre, that weighs as much as
 _TURN_SIGMA = np.radians(1.0)  # of its rotation: at a distance of 3 m
@@ -49,11 +49,8 @@ def aligned(rig: Rig, old: Rig, *, scale: bool = True) -> tuple[Rig, NDArray, fl
     weight = _gauge_weight(len(rig))
     for _ in range(20):
         now = resized(rig, factor).moved(T)
-        away = np.zeros((len(rig), COLUMNS))
-        for row, a, b in zip(away, now, old, strict=True):
-            row[POSE] = se3.log(b.T_camera_world @ a.T_world_camera)
-        G = generators(now)[:, : 7 if scale else 6]
-        step = np.linalg.lstsq(np.sqrt(weight)[:, None] * G, np.sqrt(weight) * away.ravel(), rcond=1e-12)[0]
+        G, away = generators(now)[:, : 7 if scale else 6], departure(old, now).ravel()
+        step = np.linalg.lstsq(np.sqrt(weight)[:, None] * G, np.sqrt(weight) * away, rcond=1e-12)[0]
         grow = float(np.exp(step[6])) if scale else 1.0
         T[:3, 3] *= grow
         T, factor = se3.exp(step[:6]) @ T, factor * grow

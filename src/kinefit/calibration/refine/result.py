@@ -206,8 +206,8 @@ def bias(problem: BodyProblem, bundle: Bundle) -> NDArray:
 
     def fit(start: BundleState, without: int | None) -> BundleState:
         kept = np.ones(len(owner)) if without is None else (owner != without).astype(float)
-        velocity = None if frames.velocity is None else frames.velocity[some]
-        part = replace(frames, uv=frames.uv[some], weight=frames.weight[some] * kept, velocity=velocity)
+        weight, velocity = frames.weight[some] * kept, frames.velocity[some]
+        part = replace(frames, uv=frames.uv[some], weight=weight, velocity=velocity)
         start = replace(start, offsets=state.offsets)
         return adjust(start, bundle.prior, replace(problem, frames=part), iterations=6, tolerance=1e-3).state
 

@@ -57,7 +57,7 @@ class BodyProblem(PointProblem):
     Parameters
     ----------
     model : ShapeParameters with its prior
-    frames : PixelFrames of the body, with velocities if time offsets are estimated
+    frames : PixelFrames of the body
     """
 
     model: ShapeParameters = field(kw_only=True)

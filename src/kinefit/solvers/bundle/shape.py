@@ -34,9 +34,9 @@ class PixelFrames:
     column : (N,) int, which of the K points
     uv : (F, N, 2) [px]
     weight : (F, N) [1/px²], 0 where undetected
-    share : (N,) in 0..1, optional
+    share : (N,) in 0..1
         Factor on a measurement's cost: below 1 for points with correlated errors.
-    velocity : (F, N, 2) [px/s] of the pixels, if time offsets are estimated; default: 0
+    velocity : (F, N, 2) [px/s] of the pixels, for time offsets
     """
 
     points: PointSet
@@ -44,17 +44,12 @@ class PixelFrames:
     column: NDArray
     uv: NDArray
     weight: NDArray
-    share: NDArray | None = None
-    velocity: NDArray | None = None
+    share: NDArray
+    velocity: NDArray
 
     def with_offsets(self, offsets: NDArray) -> PixelFrames:
         """The pixels corrected for clocks of cameras that are late by `offsets` (C,) [s]."""
-        return self if self.velocity is None else replace(self, uv=self.uv - offsets[self.camera, None] * self.velocity)
-
-    @property
-    def shares(self) -> NDArray:
-        """(N,) the share, 1 by default."""
-        return np.ones(len(self.column)) if self.share is None else self.share
+        return replace(self, uv=self.uv - offsets[self.camera, None] * self.velocity)
 
 
 @lru_cache(maxsize=32)  # every kind of parameters calls it again
@@ -130,10 +125,9 @@ class ShapeParameters:
         cost = _kernels_shape.frame_system(
             tree.parents, tree.dof_parent, tree.last_dof, tree.offsets, body.segment_scale, len(body.scale_groups),
             self.points.segments, rest, self.points.points, self.shift, self.mirror, rig.packed, pixels.camera,
-            pixels.column, pixels.uv[f], pixels.weight[f], pixels.shares, placed, screws,
+            pixels.column, pixels.uv[f], pixels.weight[f], pixels.share, placed, screws,
             np.ascontiguousarray(state.T_world_root[:3, 3]), loss.kind, loss.scale,
-            np.where(place < 0, -1, first + place),
-            np.zeros(pixels.uv[f].shape) if pixels.velocity is None else pixels.velocity[f], H, g,
+            np.where(place < 0, -1, first + place), pixels.velocity[f], H, g,
         )  # fmt: skip
         return H, g, cost
 
