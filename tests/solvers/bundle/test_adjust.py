@@ -31,8 +31,7 @@ def known_gauge():
 
 
 def test_information_and_covariances_are_those_of_all_unknowns_together():
-    x, pixels = scene()
-    prior = known_gauge()
+    (x, pixels), prior = scene(), known_gauge()
     start = BundleState(RIG, np.zeros(3), x)
     found = adjust(start, prior, PointProblem(pixels, SQUARED), iterations=0)
     J = np.zeros((2 * len(pixels.uv), 3 * COLUMNS + x.size))

@@ -86,9 +86,7 @@ def test_cameras_that_were_knocked_come_back_with_the_body():
     pixels, states = seen()
     delta = np.random.default_rng(2).normal(scale=0.01, size=(3, COLUMNS)) * (sigma() > 0)
     start = moved_rig(RIG, delta)
-    found = fit_body_and_cameras(
-        model(), pixels, from_mean(start, states), CameraPrior(start, sigma())
-    )
+    found = fit_body_and_cameras(model(), pixels, from_mean(start, states), CameraPrior(start, sigma()))
     left = np.abs(departure(found.rig, RIG))
     assert left[:, :3].max() < 0.02 and left[:, 3:6].max() < 2e-3
     assert np.abs(departure(start, RIG)).max() > 5 * left[:, 3:6].max()
@@ -104,9 +102,7 @@ def test_static_points_join_and_hold_the_cameras():
     prior = CameraPrior(RIG, sigma())
     away = []
     for known, start in ((None, None), (static, x + 0.01)):
-        found = fit_body_and_cameras(
-            model(), pixels, from_mean(RIG, states, start), prior, static=known
-        )
+        found = fit_body_and_cameras(model(), pixels, from_mean(RIG, states, start), prior, static=known)
         seen_at = np.stack([found.rig.cameras[c].project(x[p]) for p, c in zip(point, camera, strict=True)])
         away.append(np.abs(seen_at - uv).mean())
     assert away[1] < 0.4 * away[0]

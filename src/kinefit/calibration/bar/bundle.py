@@ -30,7 +30,6 @@ _DISTORTION_SIGMA = np.array([0.5, 0.5, 0.02, 0.02, 0.3])  # of k1, k2, p1, p2, 
 _LOSS = huber(3.0)  # [standard deviations] all but 1 % of normal errors keep full weight
 _MIN_SIGMA_PX = 0.005
 _MIN_SCATTER = 1e-6  # of the length
-_HIDDEN_COST = 1e4  # of an end that its camera cannot see: a constant that no step gains by
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +60,8 @@ class BarBundle:
 def adjust_bar(
     rig: Rig, x_world: NDArray, uv: NDArray, length: float, *, interiors: bool, sigma: float, scatter: float,
     rounds: int, iterations: int,
-) -> BarBundle:  # fmt: skip
-    """Minimise the cost over cameras and ends, with new variance components in every round.
+) -> tuple[BundleState, CameraPrior, BarProblem]:  # fmt: skip
+    """Minimise the cost over cameras and ends, with new variance components in every round; see `bar_bundle`.
 
     Parameters
     ----------
@@ -80,14 +79,19 @@ def adjust_bar(
         state, before, problem = found.state, problem, problem.with_components(found)
         if abs(problem.sigma / before.sigma - 1) < 0.02 and abs(problem.scatter / before.scatter - 1) < 0.1:
             break
-    found = adjust(state, prior, problem, iterations=0)
-    cov, to_pixels = prior.full(found.posterior.covariances()[0]), np.zeros((len(rig), 15, len(rig), COLUMNS))
+    return state, prior, problem
+
+
+def bar_bundle(state: BundleState, prior: CameraPrior, problem: BarProblem) -> BarBundle:
+    """An adjusted bundle with its covariance."""
+    found, C = adjust(state, prior, problem, iterations=0), len(state.rig)
+    cov, to_pixels = prior.full(found.posterior.covariances()[0]), np.zeros((C, 15, C, COLUMNS))
     for c, camera in enumerate(state.rig):
         (fx, fy), to_pixels[c, :, c, :-1] = np.diag(camera.matrix)[:2], np.eye(15)
         to_pixels[c, FOCAL : ASPECT + 1, c, FOCAL : ASPECT + 1] = [[fx, 0.0], [fy, fy]]
     share, J = np.zeros(prior.sigma.shape), to_pixels.reshape(-1, prior.sigma.size)
     share[prior.free] = np.clip(prior.precision * np.diag(cov)[prior.free.ravel()], 0.0, 1.0)
-    covariance = (J @ cov @ J.T).reshape(len(rig), 15, len(rig), 15)
+    covariance = (J @ cov @ J.T).reshape(C, 15, C, 15)
     return BarBundle(state.rig, state.blocks, found.detail, problem.sigma, problem.scatter, covariance, share[:, :-1])
 
 
@@ -121,8 +125,9 @@ class BarProblem(BundleProblem):
 
     @cached_property
     def seen(self) -> tuple[NDArray, ...]:
-        """Place, camera and end (M,) of every observed end; both ends of a view are consecutive."""
-        return np.nonzero(np.isfinite(self.uv).all(axis=(2, 3))[..., None] & np.ones(2, bool))
+        """Place, camera and end (M,) of every observed end, both of a view consecutive; (M, 3, 6) it by both ends."""
+        place, view, end = np.nonzero(np.isfinite(self.uv).all(axis=(2, 3))[..., None] & np.ones(2, bool))
+        return place, view, end, np.kron(np.eye(2)[end][:, None], np.eye(3))
 
     def moved(self, state: BundleState, delta: NDArray, moves: Sequence[NDArray]) -> BundleState:
         """The state with moved ends."""
@@ -150,8 +155,7 @@ class BarProblem(BundleProblem):
 
     def linearised(self, state: BundleState, prior: CameraPrior) -> tuple[Arrow, float, NDArray]:
         """Equations of cameras and ends; cost; residuals (F, C, 2, 2) [px], NaN if unobserved."""
-        (place, view, end), x = self.seen, state.blocks
-        by_ends = np.kron(np.eye(2)[end][:, None], np.eye(3))
+        (place, view, end, by_ends), x = self.seen, state.blocks
         A = pixel_rows(state.rig, prior, view, x[place, end], self.uv[place, view, end], by_block=by_ends)
         fine = np.isfinite(A[..., -1]).all(axis=1).reshape(-1, 2).all(axis=1).repeat(2)  # both ends of a view
         residuals = np.full(self.uv.shape, np.nan)
@@ -164,4 +168,5 @@ class BarProblem(BundleProblem):
         weighted = (factor / self.scatter**2)[:, None] * normals
         arrow.blocks[0].H[:] += weighted[:, :, None] * normals[:, None, :]
         arrow.blocks[0].g[:] += misfit[:, None] * weighted
-        return arrow, float(rho.sum() + of_length.sum()) + _HIDDEN_COST * float((~fine).sum()), residuals
+        hidden = 1e4 * float((~fine).sum())  # a constant that no step gains by
+        return arrow, float(rho.sum() + of_length.sum()) + hidden, residuals

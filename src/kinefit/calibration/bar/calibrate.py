@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.calibration.bar.bundle import BarBundle, adjust_bar
+from kinefit.calibration.bar.bundle import BarBundle, adjust_bar, bar_bundle
 from kinefit.calibration.bar.placing import on_floor, place
 from kinefit.calibration.bar.report import BarCameraReport, advice_of, reports_of
 from kinefit.calibration.bar.start import MIN_PLACES, first_pairs, inlier_distance, resect, with_focal
@@ -182,12 +182,12 @@ def _adjusted(
         used = np.isfinite(placed.x_world).all(axis=(1, 2))
         _check_count(int(used.sum()), len(uv))
         scatter = (1e-3, 1e-3, 1e-4, 1e-4)[n] * length
-        bundle = adjust_bar(
+        found = adjust_bar(
             rig, placed.x_world[used], placed.uv[used], length, interiors=not known, sigma=sigma, scatter=scatter,
             rounds=3 if n < 3 else 8, iterations=20,
         )  # fmt: skip
-        rig, sigma = bundle.rig, bundle.sigma
-    return bundle, placed.uv[used], used, placed.ambiguous
+        rig, sigma = found[0].rig, found[2].sigma
+    return bar_bundle(*found), placed.uv[used], used, placed.ambiguous
 
 
 def _limit(rig: Rig, known: bool) -> float:
@@ -202,11 +202,11 @@ def _grown(rig: Rig, uv: NDArray, length: float, known: bool) -> tuple[Rig, floa
         used = np.isfinite(placed.x_world).all(axis=(1, 2))
         if used.sum() < MIN_PLACES:
             return rig, np.inf, 0.0
-        bundle = adjust_bar(
+        found = adjust_bar(
             rig, placed.x_world[used], placed.uv[used], length, interiors=not known, sigma=sigma,
             scatter=5e-3 * length, rounds=2, iterations=15,
         )  # fmt: skip
-        rig, sigma = bundle.rig, bundle.sigma
+        rig, sigma = found[0].rig, found[2].sigma
         share = used.sum() / max(int((np.isfinite(uv).all(axis=(2, 3)).sum(axis=1) >= 2).sum()), 1)
     return rig, sigma, float(share)
 

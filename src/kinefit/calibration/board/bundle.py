@@ -95,8 +95,8 @@ def adjust_boards(
         state, before, problem = found.state, problem.jitter, replace(problem, jitter=problem.jitter_of(found))
         if all(abs(new / old - 1) < 0.05 for new, old in zip(problem.jitter, before)):
             break
-    found = adjust(state, prior, problem, iterations=0)
-    std = np.sqrt(np.diag(prior.full(found.posterior.covariances()[0]))).reshape(prior.sigma.shape)
+    found, std = adjust(state, prior, problem, iterations=0), np.zeros(prior.sigma.shape)
+    std[prior.free] = np.sqrt(np.diag(found.posterior.covariances()[0]))
     residuals = corners.uv - state.rig.project(corners.in_world(state.blocks), corners.camera)
     position_std, focal = np.linalg.norm(std[:, :3], axis=1), np.array([camera.matrix[0, 0] for camera in state.rig])
     return BoardBundle(

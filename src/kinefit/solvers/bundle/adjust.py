@@ -65,6 +65,7 @@ class Bundle:
     prior : CameraPrior
     arrow : Arrow, without the cameras' prior
     cost : float, with it
+    departure : (q,) of the cameras from the prior's mean
     detail : what the problem keeps
     """
 
@@ -72,12 +73,13 @@ class Bundle:
     prior: CameraPrior
     arrow: Arrow
     cost: float
+    departure: NDArray
     detail: Any
 
     @property
     def posterior(self) -> Arrow:
         """The equations with the cameras' prior."""
-        return self.prior.added(self.arrow, self.state.rig, self.state.offsets)
+        return self.prior.added(self.arrow, self.departure)
 
     @property
     def S(self) -> NDArray:
@@ -104,7 +106,8 @@ def adjust(
 
     def at(state: BundleState) -> Bundle:
         arrow, cost, detail = problem.linearised(state, prior)
-        return Bundle(state, prior, arrow, cost + prior.cost(state.rig, state.offsets), detail)
+        away = prior.departure(state.rig, state.offsets)
+        return Bundle(state, prior, arrow, cost + float(prior.precision @ away**2), away, detail)
 
     def follow(now: Bundle, move: tuple[NDArray, list[NDArray]]) -> Bundle | None:
         (delta, moves), old = move, now.state

@@ -45,13 +45,12 @@ def moved_rig(rig: Rig, delta: NDArray) -> Rig:
 def departure(rig: Rig, start: Rig) -> NDArray:
     """δ (C, 16) from the cameras of `start` to those of `rig`; zero for the time offset."""
     out = np.zeros((len(rig), COLUMNS))
-    for row, a, b in zip(out, start, rig, strict=True):
-        row[POSE] = se3.log(b.T_camera_world @ a.T_world_camera)
-        focal = np.log(np.diag(b.matrix)[:2] / np.diag(a.matrix)[:2])
-        row[FOCAL], row[ASPECT] = focal[0], focal[1] - focal[0]
-        row[CENTRE] = b.matrix[:2, 2] - a.matrix[:2, 2]
-        padded = [np.concatenate([c.distortion, np.zeros(5)])[:5] for c in (a, b)]
-        row[DISTORTION] = padded[1] - padded[0]
+    old, new = (np.array([camera.matrix for camera in r]) for r in (start, rig))
+    moved = [b.T_camera_world @ a.T_world_camera for a, b in zip(start, rig, strict=True)]
+    k_old, k_new = ([np.concatenate([c.distortion, np.zeros(5)])[:5] for c in r] for r in (start, rig))
+    out[:, POSE], out[:, FOCAL] = se3.log(np.array(moved)), np.log(new[:, 0, 0] / old[:, 0, 0])
+    out[:, ASPECT] = np.log(new[:, 1, 1] / old[:, 1, 1]) - out[:, FOCAL]
+    out[:, CENTRE], out[:, DISTORTION] = new[:, :2, 2] - old[:, :2, 2], np.array(k_new) - k_old
     return out
 
 
@@ -78,7 +77,7 @@ class CameraPrior:
         """(C, 16) int: place of each parameter among the free ones, -1 for a fixed one."""
         return np.where(self.free, np.cumsum(self.free).reshape(self.free.shape) - 1, -1)
 
-    @property
+    @cached_property
     def precision(self) -> NDArray:
         """(q,) 1/σ²."""
         return np.asarray(self.sigma[self.free] ** -2.0)
@@ -89,15 +88,11 @@ class CameraPrior:
         out[:, TIME] = offsets
         return out[self.free]
 
-    def cost(self, rig: Rig, offsets: NDArray) -> float:
-        """Cost of a rig and its time offsets (C,) [s]."""
-        return float(self.precision @ self.departure(rig, offsets) ** 2)
-
-    def added(self, arrow: Arrow, rig: Rig, offsets: NDArray) -> Arrow:
-        """Equations with this prior, at a rig and its time offsets (C,) [s]; the cameras are their last parameters."""
-        before = np.zeros(len(arrow.g) - len(self.precision))
-        pull = -self.precision * self.departure(rig, offsets)
-        return arrow.with_prior(*(np.concatenate([before, values]) for values in (self.precision, pull)))
+    def added(self, arrow: Arrow, departure: NDArray) -> Arrow:
+        """Equations with this prior, at a departure (q,); the cameras are their last parameters."""
+        before, information = np.zeros(len(arrow.g) - len(departure)), self.precision
+        both = information, -information * departure
+        return arrow.with_prior(*(np.concatenate([before, values]) for values in both))
 
     def moved(self, rig: Rig, offsets: NDArray, delta: NDArray) -> tuple[Rig, NDArray]:
         """A rig and its time offsets (C,) [s] changed by δ (q,)."""
@@ -158,8 +153,10 @@ def pixel_rows(
     motion = np.zeros(uv.shape) if motion is None else motion
     x = np.ascontiguousarray(x_world, float)
     _kernels_cameras.point_systems(rig.packed, camera, x, motion, value, by_point, by_camera)
-    own = by_point if by_block is None else by_point @ by_block
-    return np.concatenate([by_camera[..., used], own, (uv - value)[..., None]], axis=2)
+    out = np.empty((M, 2, len(used) + (3 if by_block is None else by_block.shape[2]) + 1))
+    out[..., : len(used)], out[..., -1] = by_camera[..., used], uv - value
+    out[..., len(used) : -1] = by_point if by_block is None else by_point @ by_block
+    return out
 
 
 def camera_jacobian(camera: Camera, x_world: NDArray) -> NDArray:
