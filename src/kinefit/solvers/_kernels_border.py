@@ -74,27 +74,3 @@ def point_columns(data, segment, group, frames, joints, places, out):
                 x * joint[0, k] + y * joint[1, k] + z * joint[2, k]
                 + a * place[0, k] + b * place[1, k] + c * place[2, k]
             )  # fmt: skip
-
-
-@jit
-def camera_columns(data, camera, poses, first, out):
-    """Write into out (N, p) the whitened derivatives of rows by the twist of each row's camera (N,).
-
-    poses (C, 4, 4) of the world in the cameras, first (C,) column of each, -1 for one that stays.
-    """
-    for i in range(camera.size):
-        k = first[camera[i]]
-        if k < 0:
-            continue
-        T, w = poses[camera[i]], math.sqrt(data[7, i])
-        x, y, z = data[0, i], data[1, i], data[2, i]
-        p = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-        q = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-        r = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-        x, y, z = w * data[3, i], w * data[4, i], w * data[5, i]
-        a = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z
-        b = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z
-        c = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z
-        row = out[i]
-        row[k], row[k + 1], row[k + 2] = a, b, c
-        row[k + 3], row[k + 4], row[k + 5] = q * c - r * b, r * a - p * c, p * b - q * a

@@ -16,7 +16,6 @@ from kinefit.rows import Rows
 from kinefit.sensors.base import Sensor, Unknown, of_kind
 from kinefit.sensors.displaced import AXES, CLOCK
 from kinefit.sensors.settings import CameraErrors
-from kinefit.solvers import _kernels_border
 from kinefit.solvers.equations import inverse
 from kinefit.subject.parameters import Parameters, World, place_spread
 
@@ -179,10 +178,12 @@ class CameraExtrinsics(Parameters):
         out = np.zeros((len(rows), 6 * len(self.free)))
         if not len(camera):
             return out
-        first = np.full(len(rig), -1)
-        first[[rig.index(name) for name in self.free]] = 6 * np.arange(len(self.free))
-        poses = np.array([c.T_camera_world for c in rig])
-        _kernels_border.camera_columns(rows.data, np.ascontiguousarray(camera, np.int64), poses, first, out)
+        T = np.array([c.T_camera_world for c in rig])[camera]
+        x, turned = se3.apply(T, rows.data[:3].T), T[:, :3, :3] @ (np.sqrt(rows.data[7]) * rows.data[3:6]).T[..., None]
+        J = np.concatenate([turned[..., 0], np.cross(x, turned[..., 0])], axis=1)
+        for k, name in enumerate(self.free):
+            own = camera == rig.index(name)
+            out[own, 6 * k : 6 * k + 6] = J[own]
         return out
 
 

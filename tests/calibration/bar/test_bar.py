@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 from benchmarks.bar_scene import bar_rig, draw_bar, see_bar, wave_bar
 
-from kinefit.calibration.bar.bundle import INTERIOR, POSE, BarProblem
+from kinefit.calibration.bar.bundle import BarProblem
 from kinefit.calibration.bar.calibrate import calibrate_bar
 from kinefit.calibration.bar.placing import on_floor, place
 from kinefit.calibration.bar.start import epipolar, flat
 from kinefit.calibration.bar.table import read_centroids
 from kinefit.calibration.bar.targets import BarViews, targets_in
-from kinefit.calibration.board.bundle import moved_camera
 from kinefit.errors import CalibrationError, FileError
 from kinefit.geometry import se3
-from kinefit.geometry.camera import Rig
+from kinefit.solvers.bundle.adjust import BundleState, adjust
+from kinefit.solvers.bundle.cameras import CENTRE, COLUMNS, TIME, CameraPrior
 
 LENGTH = 0.9
 
@@ -79,21 +79,22 @@ def test_derivatives_of_the_adjustment(known):
     rig, ends, seen = known
     uv = np.stack([np.stack([seen[c.name].ends.get(f, np.full((2, 2), np.nan)) for c in rig]) for f in range(5)])
     x = ends[:5] + 1e-3
-    problem = BarProblem(uv, LENGTH, interiors=True, sigma=1e3, scatter=10.0)  # far from the losses' bends
-    problem.free[:] = True
-    system = problem.system(rig, x)
-    rng = np.random.default_rng(0)
-    size = np.tile(np.concatenate([np.full(POSE, 1e-5), np.full(4, 1e-2), np.full(len(INTERIOR) - 4, 1e-5)]), len(rig))
+    problem, sigma = BarProblem(uv, LENGTH, 1e3, 10.0), np.full((len(rig), COLUMNS), 2.0)  # far from the losses' bends
+    sigma[:, TIME], prior = 0.0, CameraPrior(rig, sigma)
+    rng, zero = np.random.default_rng(0), np.zeros(len(rig))
+    start = BundleState(*prior.moved(rig, zero, 1e-3 * rng.normal(size=prior.free.sum())), x)
+    arrow = adjust(start, prior, problem, iterations=0).posterior
+    size = np.full((len(rig), COLUMNS), 1e-5)
+    size[:, CENTRE] = 1e-2
     for _ in range(4):
-        step, move = rng.normal(size=size.shape) * size, 1e-5 * rng.normal(size=x.shape)
+        step, move = rng.normal(size=prior.free.sum()) * size[prior.free], 1e-5 * rng.normal(size=x.shape)
 
         def cost(sign, step=step, move=move):
-            parts = (sign * step).reshape(len(rig), -1)
-            there = Rig(tuple(moved_camera(c, d, True) for c, d in zip(rig, parts)))
-            return problem.system(there, x + sign * move).cost
+            there, _ = prior.moved(start.rig, zero, sign * step)
+            return adjust(BundleState(there, zero, x + sign * move), prior, problem, iterations=0).cost
 
         numeric = (cost(1.0) - cost(-1.0)) / 2
-        told = -2 * (system.arrow.g @ step + np.sum(system.arrow.blocks[0].g * move.reshape(-1, 6)))
+        told = -2 * (arrow.g @ step + np.sum(arrow.blocks[0].g * move.reshape(-1, 6)))
         assert told == pytest.approx(numeric, rel=1e-4)
 
 

@@ -8,8 +8,9 @@ from tests.oracle import posture, rig_around
 
 from kinefit.bodies import BodyState, load_body
 from kinefit.losses import geman_mcclure
-from kinefit.solvers.bundle.body_bundle import BundleState, adjust
-from kinefit.solvers.bundle.cameras import COLUMNS, TIME, CameraPrior, PointPixels, departure, moved_rig
+from kinefit.solvers.bundle.adjust import BundleState, adjust
+from kinefit.solvers.bundle.body_bundle import BodyProblem
+from kinefit.solvers.bundle.cameras import COLUMNS, FOCAL, TIME, CameraPrior, PointPixels, departure, moved_rig
 from kinefit.solvers.bundle.shape import PixelFrames, shape_parameters
 
 BODY = load_body("humanoid")
@@ -30,7 +31,8 @@ def seen(frames=15, noise=1.0):
     uv = np.concatenate([c.project(x) for c in RIG], axis=1)
     uv += noise * random.normal(size=uv.shape)
     camera, column = np.repeat(np.arange(3), len(SET)), np.tile(np.arange(len(SET)), 3)
-    return PixelFrames(SET, camera, column, uv, np.full(uv.shape[:2], max(noise, 0.5) ** -2)), states
+    weight = np.full(uv.shape[:2], max(noise, 0.5) ** -2)
+    return PixelFrames(SET, camera, column, uv, weight, np.ones(len(column)), np.zeros(uv.shape)), states
 
 
 def model():
@@ -41,7 +43,7 @@ def sigma(**others):
     out = np.zeros((3, COLUMNS))
     out[1:, :3], out[1:, 3:6] = 0.05, 0.03
     for name, value in others.items():
-        out[:, {"focal": 6, "time": TIME}[name]] = value
+        out[:, {"focal": FOCAL, "time": TIME}[name]] = value
     return out
 
 
@@ -60,7 +62,8 @@ def test_derivatives_by_the_cameras_agree_with_differences():
         return float(np.sum(share * s2 / (1 + s2 / loss.scale**2)))
 
     moving = replace(pixels, share=share, velocity=velocity[None])
-    H, g, _ = parameters.equations(theta, states[0], RIG, moving, 0, loss=loss, freedom=np.ones((3, COLUMNS)))
+    place = CameraPrior(RIG, np.ones((3, COLUMNS))).place
+    H, g, _ = parameters.equations(theta, states[0], RIG, place, moving, 0, loss)
     assert H.shape == (first + 3 * COLUMNS,) * 2
     for k in range(3 * COLUMNS):
         step = np.zeros(3 * COLUMNS)
@@ -74,16 +77,16 @@ def from_mean(rig, states, x=None):
 
 
 def fit_body_and_cameras(model, pixels, start, prior, static=None):
-    return adjust(start, prior, static, model=model, frames=pixels, max_iterations=20, tolerance=1e-3)
+    static = static or PointPixels(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
+    problem = BodyProblem(static, model=model, frames=pixels)
+    return adjust(start, prior, problem, iterations=20, tolerance=1e-3).state
 
 
 def test_cameras_that_were_knocked_come_back_with_the_body():
     pixels, states = seen()
     delta = np.random.default_rng(2).normal(scale=0.01, size=(3, COLUMNS)) * (sigma() > 0)
     start = moved_rig(RIG, delta)
-    found = fit_body_and_cameras(
-        model(), pixels, from_mean(start, states), CameraPrior(start, sigma())
-    )
+    found = fit_body_and_cameras(model(), pixels, from_mean(start, states), CameraPrior(start, sigma()))
     left = np.abs(departure(found.rig, RIG))
     assert left[:, :3].max() < 0.02 and left[:, 3:6].max() < 2e-3
     assert np.abs(departure(start, RIG)).max() > 5 * left[:, 3:6].max()
@@ -99,13 +102,11 @@ def test_static_points_join_and_hold_the_cameras():
     prior = CameraPrior(RIG, sigma())
     away = []
     for known, start in ((None, None), (static, x + 0.01)):
-        found = fit_body_and_cameras(
-            model(), pixels, from_mean(RIG, states, start), prior, static=known
-        )
+        found = fit_body_and_cameras(model(), pixels, from_mean(RIG, states, start), prior, static=known)
         seen_at = np.stack([found.rig.cameras[c].project(x[p]) for p, c in zip(point, camera, strict=True)])
         away.append(np.abs(seen_at - uv).mean())
     assert away[1] < 0.4 * away[0]
-    np.testing.assert_allclose(found.x_static, x, atol=0.01)
+    np.testing.assert_allclose(found.blocks, x, atol=0.01)
 
 
 def test_the_order_of_what_is_known_decides_what_moves():

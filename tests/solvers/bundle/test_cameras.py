@@ -5,8 +5,9 @@ import pytest
 from tests.oracle import rig_around
 
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.losses import SQUARED, geman_mcclure
-from kinefit.solvers.bundle.body_bundle import BundleState, adjust
+from kinefit.losses import SQUARED
+from kinefit.solvers.bundle.adjust import BundleState, adjust
+from kinefit.solvers.bundle.body_bundle import PointProblem
 from kinefit.solvers.bundle.cameras import (
     COLUMNS,
     FOCAL,
@@ -17,12 +18,16 @@ from kinefit.solvers.bundle.cameras import (
     departure,
     moved_camera,
     moved_rig,
-    point_arrow,
 )
 
 
 def bundle_adjust(rig, pixels, x, prior, **options):
-    return adjust(BundleState(rig, np.zeros(len(rig)), x), prior, pixels, **options)
+    return adjust(BundleState(rig, np.zeros(len(rig)), x), prior, PointProblem(pixels), **options).state
+
+
+def point_arrow(rig, free, pixels, x):
+    state = BundleState(rig, np.zeros(len(rig)), x)
+    return PointProblem(pixels, SQUARED).linearised(state, CameraPrior(rig, free))[:2]
 
 
 def residuals(rig, offsets, pixels, x):
@@ -49,11 +54,12 @@ def a_camera(lens):
 def test_derivatives_by_a_cameras_parameters(lens):
     camera, x = a_camera(lens), np.random.default_rng(0).uniform(-0.7, 0.7, (6, 3))
     J = camera_jacobian(camera, x)
-    for k in range(TIME):
+    for k in range(TIME - (lens == "fisheye")):
         step = np.zeros(COLUMNS)
         step[k] = 1e-6
         numeric = (moved_camera(camera, step).project(x) - moved_camera(camera, -step).project(x)) / 2e-6
-        np.testing.assert_allclose(J[:, :, k], numeric, rtol=1e-5, atol=1e-3)
+        np.testing.assert_allclose(J[:, :, k], numeric, rtol=1e-5, atol=3e-5)
+        assert np.abs(J[:, :, k]).max() > 5e-4
 
 
 def test_the_way_between_two_rigs_leads_there():
@@ -77,18 +83,20 @@ def many_points(noise=0.5, count=40):
 
 def test_points_taken_out_leave_the_dense_solution():
     rig, x, pixels = many_points()
-    freedom = np.ones((3, COLUMNS))
-    freedom[:, TIME] = 0.0
+    free = np.ones((3, COLUMNS))
+    free[1:, TIME] = free[0, :6] = 0.0
     motion = np.random.default_rng(3).normal(size=(len(pixels.uv), 2))
     pixels = PointPixels(pixels.camera, pixels.point, pixels.uv, pixels.weight, motion)
-    arrow, _ = point_arrow(rig, np.zeros(3), freedom, pixels, x, SQUARED)
+    arrow, _ = point_arrow(rig, free, pixels, x)
     S_found, b_found, (back_found,) = arrow.reduced(*arrow.relative(0.0))
-    size = 3 * COLUMNS
-    J = np.zeros((2 * len(pixels.uv), size + x.size))
+    size, used = int(free.sum()), np.concatenate([free.ravel() > 0, np.ones(x.size, bool)])
+    J = np.zeros((2 * len(pixels.uv), len(used)))
     for m, (c, p) in enumerate(zip(pixels.camera, pixels.point, strict=True)):
         rows = slice(2 * m, 2 * m + 2)
-        J[rows, c * COLUMNS : (c + 1) * COLUMNS] = camera_jacobian(rig.cameras[c], x[p : p + 1])[0] * freedom[c]
-        J[rows, size + 3 * p : size + 3 * p + 3] = rig.cameras[c].project_with_jacobian(x[p])[1]
+        J[rows, c * COLUMNS : (c + 1) * COLUMNS] = camera_jacobian(rig.cameras[c], x[p : p + 1])[0]
+        J[rows, c * COLUMNS + TIME] = motion[m]
+        J[rows, free.size + 3 * p : free.size + 3 * p + 3] = rig.cameras[c].project_with_jacobian(x[p])[1]
+    J = J[:, used]
     r = residuals(rig, np.zeros(3), pixels, x).ravel()
     H, g = 4.0 * J.T @ J, 4.0 * J.T @ r
     A, B, D = H[:size, :size], H[:size, size:], H[size:, size:]
@@ -108,8 +116,8 @@ def test_a_bundle_of_free_points_finds_the_cameras_again():
     delta = np.random.default_rng(5).normal(scale=0.01, size=(3, COLUMNS)) * (sigma > 0)
     start = moved_rig(rig, delta)
     start_x = x + np.random.default_rng(6).normal(scale=0.02, size=x.shape)
-    bundle = bundle_adjust(start, pixels, start_x, CameraPrior(start, sigma), max_iterations=60, tolerance=1e-12)
-    left = residuals(bundle.rig, bundle.offsets, pixels, bundle.x_static)
+    bundle = bundle_adjust(start, pixels, start_x, CameraPrior(start, sigma), iterations=60, tolerance=1e-12)
+    left = residuals(bundle.rig, bundle.offsets, pixels, bundle.blocks)
     assert np.abs(left).max() < 0.05
     assert np.abs(departure(bundle.rig, rig)).max() < 2e-3
 
@@ -121,9 +129,7 @@ def test_outliers_hardly_move_a_bundle():
     spoilt = PointPixels(pixels.camera, pixels.point, uv, pixels.weight)
     sigma = np.zeros((3, COLUMNS))
     sigma[:, :6] = 0.01
-    clean, robust = (
-        bundle_adjust(rig, p, x, CameraPrior(rig, sigma), loss=geman_mcclure()).rig for p in (pixels, spoilt)
-    )
+    clean, robust = (bundle_adjust(rig, p, x, CameraPrior(rig, sigma)).rig for p in (pixels, spoilt))
     assert np.abs(departure(robust, clean)).max() < 1.5e-3
 
 
@@ -131,7 +137,7 @@ def test_what_a_camera_cannot_see_counts_as_an_outlier():
     rig, x, pixels = many_points(count=30)
     behind = x.copy()
     behind[0] = rig.cameras[0].centre_world - 1.0 * rig.cameras[0].T_camera_world[2, :3]
-    arrow, cost = point_arrow(rig, np.zeros(3), np.ones((3, COLUMNS)), pixels, behind, SQUARED)
+    arrow, cost = point_arrow(rig, np.ones((3, COLUMNS)), pixels, behind)
     assert np.isfinite(arrow.H).all() and np.isfinite(arrow.g).all() and np.isfinite(cost)
 
 

@@ -9,24 +9,25 @@ scatter of the distance are estimated as variance components (W. Förstner, 1979
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.calibration.board.bundle import CameraEquations, moved_rig, pixel_columns
-from kinefit.geometry import se3
+from kinefit.calibration.bar.start import with_focal
 from kinefit.geometry.camera import Rig
 from kinefit.losses import huber
-from kinefit.solvers.bundle.arrow import Blocks, assembled
-from kinefit.solvers.least_squares import descend
+from kinefit.solvers.bundle.adjust import Bundle, BundleProblem, BundleState, adjust
+from kinefit.solvers.bundle.arrow import Arrow, assembled
+from kinefit.solvers.bundle.cameras import ASPECT, CENTRE, COLUMNS, DISTORTION, FOCAL, POSE, CameraPrior, pixel_rows
 
-POSE = 6
 INTERIOR = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 _CENTRE_SIGMA = 0.05  # of the image's width, of the principal point about the image's centre
 _ASPECT_SIGMA = 0.02  # of the image's width, of fx - fy
 _DISTORTION_SIGMA = np.array([0.5, 0.5, 0.02, 0.02, 0.3])  # of k1, k2, p1, p2, k3 about zero
-_HUBER = 3.0  # [standard deviations] all but 1 % of normal errors keep full weight
+_LOSS = huber(3.0)  # [standard deviations] all but 1 % of normal errors keep full weight
 _MIN_SIGMA_PX = 0.005
 _MIN_SCATTER = 1e-6  # of the length
 
@@ -42,10 +43,9 @@ class BarBundle:
     residuals : (F, C, 2, 2) [px] measured minus projected; NaN if unobserved.
     sigma : float [px] standard deviation of a pixel coordinate.
     scatter : float [m] standard deviation of the distance of the ends in one place.
-    covariance : (C · P, C · P) of the cameras' parameters, P = 6 for the twist (v, ω) in the camera's frame, and 9
-        for the intrinsics if these were estimated; zero for fixed parameters.
-    ends : (F, 6, 6) [m²] covariance of each place's ends.
-    prior_share : (C · P,) share 0..1 of the prior in the information on each parameter.
+    covariance : (C, 15, C, 15) of the cameras' parameters: twist (v, ω) in the camera's frame, then `INTERIOR`; zero
+        for fixed parameters.
+    prior_share : (C, 15) share 0..1 of the prior in the information on each parameter.
     """
 
     rig: Rig
@@ -54,143 +54,119 @@ class BarBundle:
     sigma: float
     scatter: float
     covariance: NDArray
-    ends: NDArray
     prior_share: NDArray
 
 
+def adjust_bar(
+    rig: Rig, x_world: NDArray, uv: NDArray, length: float, *, interiors: bool, sigma: float, scatter: float,
+    rounds: int, iterations: int,
+) -> tuple[BundleState, CameraPrior, BarProblem]:  # fmt: skip
+    """Minimise the cost over cameras and ends, with new variance components in every round; see `bar_bundle`.
+
+    Parameters
+    ----------
+    x_world : (F, 2, 3) [m] ends to start from
+    uv : (F, C, 2, 2) [px] of place, camera, end; NaN if unobserved
+    length : float [m]
+    interiors : whether intrinsics are free
+    sigma, scatter : float [px], [m] initial standard deviations
+    rounds, iterations : at most, and steps in each round
+    """
+    prior, problem = _common_cameras(rig, interiors), BarProblem(uv, length, sigma, scatter)
+    state = BundleState(rig, np.zeros(len(rig)), x_world)
+    for _ in range(rounds):
+        found = adjust(state, prior, problem, iterations=iterations, damping=1e-4, tolerance=1e-7)
+        state, before, problem = found.state, problem, problem.with_components(found)
+        if abs(problem.sigma / before.sigma - 1) < 0.02 and abs(problem.scatter / before.scatter - 1) < 0.1:
+            break
+    return state, prior, problem
+
+
+def bar_bundle(state: BundleState, prior: CameraPrior, problem: BarProblem) -> BarBundle:
+    """An adjusted bundle with its covariance."""
+    found, C = adjust(state, prior, problem, iterations=0), len(state.rig)
+    cov, to_pixels = prior.full(found.posterior.covariances()[0]), np.zeros((C, 15, C, COLUMNS))
+    for c, camera in enumerate(state.rig):
+        (fx, fy), to_pixels[c, :, c, :-1] = np.diag(camera.matrix)[:2], np.eye(15)
+        to_pixels[c, FOCAL : ASPECT + 1, c, FOCAL : ASPECT + 1] = [[fx, 0.0], [fy, fy]]
+    share, J = np.zeros(prior.sigma.shape), to_pixels.reshape(-1, prior.sigma.size)
+    share[prior.free] = np.clip(prior.precision * np.diag(cov)[prior.free.ravel()], 0.0, 1.0)
+    covariance = (J @ cov @ J.T).reshape(C, 15, C, 15)
+    return BarBundle(state.rig, state.blocks, found.detail, problem.sigma, problem.scatter, covariance, share[:, :-1])
+
+
+def _common_cameras(rig: Rig, interiors: bool) -> CameraPrior:
+    """A principal point near the image's centre, square pixels, little distortion; the first pose fixed."""
+    sigma = np.zeros((len(rig), COLUMNS))
+    sigma[1:, POSE] = np.inf
+    if not interiors:
+        return CameraPrior(rig, sigma)
+    width, focal = (np.array([value(c) for c in rig]) for value in (lambda c: max(c.size), lambda c: c.matrix[0, 0]))
+    sigma[:, FOCAL], sigma[:, ASPECT] = np.inf, _ASPECT_SIGMA * width / focal
+    sigma[:, CENTRE], sigma[:, DISTORTION] = _CENTRE_SIGMA * width[:, None], _DISTORTION_SIGMA
+    return CameraPrior(Rig(tuple(with_focal(c, f, False) for c, f in zip(rig, focal / width))), sigma)
+
+
 @dataclass(frozen=True, eq=False)
-class _BarEquations(CameraEquations):
-    residuals: NDArray
-    misfit: NDArray  # (F,) [m] of the distance
-    squares: float  # weighted squares of pixels alone
-    count: int  # pixel coordinates
-
-
-class BarProblem:
-    """Observations and free parameters of the adjustment.
+class BarProblem(BundleProblem):
+    """Pixels of the ends (F, 2, 3) [m] of a bar, the blocks, and its length.
 
     Parameters
     ----------
     uv : (F, C, 2, 2) [px] of place, camera, end; NaN if unobserved.
     length : float [m]
-    interiors : bool, whether intrinsics are free.
-    sigma, scatter : float [px], [m] initial standard deviations.
+    sigma, scatter : float [px], [m] standard deviations of a pixel coordinate and of the distance
     """
 
-    def __init__(self, uv: NDArray, length: float, *, interiors: bool, sigma: float, scatter: float) -> None:
-        self.uv, self.length, self.interiors = uv, length, interiors
-        self.sigma, self.scatter = sigma, scatter
-        self.columns = POSE + len(INTERIOR) * interiors
-        self.free = np.ones((uv.shape[1], self.columns), bool)
-        self.free[0, :POSE] = False
+    uv: NDArray
+    length: float
+    sigma: float
+    scatter: float
 
-    def adjust(self, rig: Rig, x_world: NDArray, *, rounds: int = 4, iterations: int = 15) -> tuple[Rig, NDArray]:
-        """Minimise the cost over the rig and ends (F, 2, 3) [m], with new variance components in every round."""
-        for _ in range(rounds):
-            system = descend(
-                self.system(rig, x_world), lambda at, damping: at.arrow.relative_step(damping), self._moved,
-                iterations=iterations, damping=1e-4, tolerance=1e-7,
-            ).at  # fmt: skip
-            rig, x_world = system.rig, system.unknowns
-            before = self.sigma, self.scatter
-            self._components(rig, system)
-            if abs(self.sigma / before[0] - 1) < 0.02 and abs(self.scatter / before[1] - 1) < 0.1:
-                break
-        return rig, x_world
-
-    def _moved(self, at: _BarEquations, move: tuple[NDArray, list[NDArray]]) -> _BarEquations | None:
-        try:
-            rig = moved_rig(at.rig, move[0], self.interiors)
-        except (ValueError, ArithmeticError, np.linalg.LinAlgError):
-            return None
-        return self.system(rig, at.unknowns + move[1][0].reshape(at.unknowns.shape))
-
-    def _components(self, rig: Rig, system: _BarEquations) -> None:
-        """Estimate the variances of pixels and distance from their squares and shares of the redundancy."""
-        cov, ends = system.covariances()
-        prior = self._prior(rig)[0]
-        x = self._normals
-        of_length = np.einsum("fi,fij,fj->f", x, ends, x) / self.scatter**2
-        places = len(self.uv)
-        unknown = self.free.sum() + 6 * places - np.sum(of_length) - np.sum(prior * np.diag(cov))
-        self.sigma = max(np.sqrt(system.squares / max(system.count - unknown, 1.0)) * self.sigma, _MIN_SIGMA_PX)
-        square = 1.4826 * np.median(np.abs(system.misfit))  # robust: one wrong place must not weaken all others
-        left = max(1.0 - float(np.mean(of_length)), 0.05)
-        self.scatter = max(square / np.sqrt(left), _MIN_SCATTER * self.length)
-
-    def result(self, rig: Rig, x_world: NDArray) -> BarBundle:
-        """The bundle with covariances, at the rig and ends (F, 2, 3) [m] of `adjust`."""
-        system = self.system(rig, x_world)
-        cov, ends = system.covariances()
-        prior = self._prior(rig)[0]
-        share = np.clip(prior * np.diag(cov), 0.0, 1.0)
-        return BarBundle(rig, x_world, system.residuals, self.sigma, self.scatter, cov, ends, share)
-
-    def _prior(self, rig: Rig) -> tuple[NDArray, NDArray]:
-        """Information (n,) and pull (n,) of the priors on single parameters (fx - fy is not one)."""
-        information, pull = np.zeros(self.free.shape), np.zeros(self.free.shape)
-        if self.interiors:
-            for c, camera in enumerate(rig):
-                width = max(camera.size)
-                now = np.concatenate([camera.matrix[:2, 2] - (np.array(camera.size) - 1) / 2, camera.distortion])
-                deviation = np.concatenate([np.full(2, _CENTRE_SIGMA * width), _DISTORTION_SIGMA])
-                information[c, POSE + 2 :] = 1.0 / deviation**2
-                pull[c, POSE + 2 :] = -now / deviation**2
-        return information.ravel(), pull.ravel()
-
-    def system(self, rig: Rig, x_world: NDArray) -> _BarEquations:
-        """Linearise at a rig and ends (F, 2, 3) [m]."""
+    @cached_property
+    def seen(self) -> tuple[NDArray, ...]:
+        """Place, camera and end (M,) of every observed end, both of a view consecutive; (M, 3, 6) it by both ends."""
         place, view, end = np.nonzero(np.isfinite(self.uv).all(axis=(2, 3))[..., None] & np.ones(2, bool))
-        P, M, C = self.columns, len(place), len(rig)
-        A = np.zeros((M, 2, P + 7))  # derivatives by the camera, by the ends; residual
-        for c, camera in enumerate(rig):
-            own = view == c
-            x = se3.apply(camera.T_camera_world, x_world[place[own], end[own]])
-            uv, J, J_interior = pixel_columns(camera, np.where(x[:, 2:] > 1e-3, x, [0.0, 0.0, 1.0]), self.interiors)
-            A[own, :, :P] = np.concatenate([J, np.cross(x[:, None], J), J_interior], axis=2) * self.free[c]
-            of_end = (J @ camera.T_camera_world[:3, :3])[:, :, None] * (end[own, None] == (0, 1))[:, None, :, None]
-            A[own, :, P:-1] = of_end.reshape(-1, 2, 6)
-            A[own, :, -1] = np.where(x[:, 2:] > 1e-3, self.uv[place[own], c, end[own]] - uv, np.nan)
-        fine = np.isfinite(A[..., -1]).all(axis=1).reshape(-1, 2).all(axis=1).repeat(2)  # both ends of a view
-        A[~fine] = 0.0
-        squares = np.sum(A[..., -1] ** 2, axis=1)
-        rho, factor = huber(_HUBER).weigh(squares / self.sigma**2)
-        w = np.where(fine, factor, 0.0) / self.sigma**2
-        cost = float(rho.sum()) + 1e4 * float((~fine).sum())  # a constant that no step gains by
-        residuals = np.full(self.uv.shape, np.nan)
-        residuals[place, view, end] = np.where(fine[:, None], A[..., -1], np.nan)
-        arrow = assembled(A.swapaxes(1, 2) @ (w[:, None, None] * A), view, place, C, len(self.uv), 6)
-        information, pull = self._prior(rig)
-        cost += float(np.sum(pull**2 / np.where(information > 0, information, 1.0)))
-        arrow = arrow.with_prior(information + ~self.free.ravel(), pull)
-        if self.interiors:
-            cost += self._square_pixels(rig, arrow.H, arrow.g)
-        misfit, more = self._distances(x_world, arrow.blocks[0])
-        return _BarEquations(
-            rig, x_world, arrow, self.free.ravel(), cost + more, residuals, misfit, float(w @ squares),
-            2 * int(fine.sum()),
-        )
+        return place, view, end, np.kron(np.eye(2)[end][:, None], np.eye(3))
 
-    def _square_pixels(self, rig: Rig, H: NDArray, b: NDArray) -> float:
-        """Add the prior fx - fy = 0 of each camera; returns its cost."""
-        cost = 0.0
-        for c, camera in enumerate(rig):
-            weight, at = 1.0 / (_ASPECT_SIGMA * max(camera.size)) ** 2, c * self.columns + POSE
-            off = float(camera.matrix[1, 1] - camera.matrix[0, 0])
-            H[at : at + 2, at : at + 2] += weight * np.array([[1.0, -1.0], [-1.0, 1.0]])
-            b[at : at + 2] += weight * off * np.array([1.0, -1.0])
-            cost += weight * off**2
-        return cost
+    def moved(self, state: BundleState, delta: NDArray, moves: Sequence[NDArray]) -> BundleState:
+        """The state with moved ends."""
+        return replace(state, blocks=state.blocks + moves[0].reshape(state.blocks.shape))
 
-    def _distances(self, x_world: NDArray, ends: Blocks) -> tuple[NDArray, float]:
-        """Add |b - a| = length of each place; returns the misfits (F,) [m] and the cost."""
-        way = x_world[:, 1] - x_world[:, 0]
+    def with_components(self, found: Bundle) -> BarProblem:
+        """The problem with variances of pixels and distance, from their squares and shares of the redundancy."""
+        (cov, (ends,)), (misfit, normals) = found.posterior.covariances(), self._misfit(found.state.blocks)
+        of_length = np.einsum("fi,fij,fj->f", normals, ends, normals) / self.scatter**2
+        unknown = len(cov) + ends.shape[1] * len(ends) - np.sum(of_length) - found.prior.precision @ np.diag(cov)
+        squares = np.sum(found.detail[np.isfinite(found.detail).all(axis=(2, 3))] ** 2, axis=2).ravel()
+        weighted = squares @ _LOSS.factor(squares / self.sigma**2)
+        sigma = np.sqrt(weighted / max(2 * len(squares) - unknown, 1.0))
+        square = 1.4826 * np.median(np.abs(misfit))  # robust: a wrong place must not weaken all others
+        left = max(1.0 - float(np.mean(of_length)), 0.05)
+        scatter = max(square / np.sqrt(left), _MIN_SCATTER * self.length)
+        return replace(self, sigma=max(sigma, _MIN_SIGMA_PX), scatter=scatter)
+
+    def _misfit(self, x: NDArray) -> tuple[NDArray, NDArray]:
+        """(F,) [m] by which ends (F, 2, 3) are too near to each other, and derivatives (F, 6) of their distance."""
+        way = x[:, 1] - x[:, 0]
         distance = np.linalg.norm(way, axis=1)
         n = way / np.maximum(distance, 1e-12)[:, None]
-        self._normals = np.concatenate([-n, n], axis=1)
-        misfit = self.length - distance
-        rho, factor = huber(_HUBER).weigh((misfit / self.scatter) ** 2)
-        w = factor / self.scatter**2
-        ends.H[:] += w[:, None, None] * self._normals[:, :, None] * self._normals[:, None, :]
-        ends.g[:] += (w * misfit)[:, None] * self._normals
-        return misfit, float(rho.sum())
+        return self.length - distance, np.concatenate([-n, n], axis=1)
+
+    def linearised(self, state: BundleState, prior: CameraPrior) -> tuple[Arrow, float, NDArray]:
+        """Equations of cameras and ends; cost; residuals (F, C, 2, 2) [px], NaN if unobserved."""
+        (place, view, end, by_ends), x = self.seen, state.blocks
+        A = pixel_rows(state.rig, prior, view, x[place, end], self.uv[place, view, end], by_block=by_ends)
+        fine = np.isfinite(A[..., -1]).all(axis=1).reshape(-1, 2).all(axis=1).repeat(2)  # both ends of a view
+        residuals = np.full(self.uv.shape, np.nan)
+        residuals[place, view, end] = np.where(fine[:, None], A[..., -1], np.nan)
+        A[~fine] = 0.0
+        rho, factor = _LOSS.weigh(np.sum(A[..., -1] ** 2, axis=1) / self.sigma**2)
+        grams = A.swapaxes(1, 2) @ ((factor / self.sigma**2)[:, None, None] * A)
+        arrow, (misfit, normals) = assembled(grams, view, place, prior.free, len(x)), self._misfit(x)
+        of_length, factor = _LOSS.weigh((misfit / self.scatter) ** 2)
+        weighted = (factor / self.scatter**2)[:, None] * normals
+        arrow.blocks[0].H[:] += weighted[:, :, None] * normals[:, None, :]
+        arrow.blocks[0].g[:] += misfit[:, None] * weighted
+        hidden = 1e4 * float((~fine).sum())  # a constant that no step gains by
+        return arrow, float(rho.sum() + of_length.sum()) + hidden, residuals

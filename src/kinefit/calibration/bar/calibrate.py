@@ -9,14 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.calibration.bar.bundle import INTERIOR, POSE, BarBundle, BarProblem
+from kinefit.calibration.bar.bundle import BarBundle, adjust_bar, bar_bundle
 from kinefit.calibration.bar.placing import on_floor, place
 from kinefit.calibration.bar.report import BarCameraReport, advice_of, reports_of
-from kinefit.calibration.bar.start import MIN_PLACES, first_pairs, inlier_distance, resect
+from kinefit.calibration.bar.start import MIN_PLACES, first_pairs, inlier_distance, resect, with_focal
 from kinefit.calibration.bar.targets import BarViews
 from kinefit.calibration.board.intrinsics import known_camera
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.solvers.bundle.cameras import FOCAL
 
 LENGTH_SIGMA = 1e-4  # [m] of a bar measured with a calliper or a good rule
 _MIN_LENGTH = 0.01  # [m]
@@ -47,7 +48,7 @@ class BarCalibration:
         Description of the origin and the vertical axis.
     advice : tuple of str
         What else to record.
-    covariance : (C · P, C · P), as in `BarBundle`, in the gauge of the first camera.
+    covariance : (C · 15, C · 15), as in `BarBundle`, in the gauge of the first camera.
     """
 
     rig: Rig
@@ -116,7 +117,8 @@ def calibrate_bar(
     x_world = bundle.x_world @ T_new_world[:3, :3].T + T_new_world[:3, 3]
     return BarCalibration(
         rig, length, reports, bundle.sigma, bundle.scatter, frames[used], x_world, used_uv, bundle.residuals,
-        int(ambiguous.sum()), int((~used & ~ambiguous).sum()), world, tuple(advice_of(rig, reports)), bundle.covariance,
+        int(ambiguous.sum()), int((~used & ~ambiguous).sum()), world, tuple(advice_of(rig, reports)),
+        bundle.covariance.reshape(15 * len(rig), -1),
     )
 
 
@@ -138,9 +140,7 @@ def check_cameras(names: Collection[str]) -> None:
 
 def _camera(name: str, views: BarViews, interiors: Rig | None) -> Camera:
     if interiors is None:
-        width, height = views.size
-        K = np.array([[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]])
-        return Camera(name, views.size, K, np.zeros(5))
+        return with_focal(Camera(name, views.size, np.eye(3)), 1.0, False)
     return known_camera(interiors, name, views.size)
 
 
@@ -182,10 +182,12 @@ def _adjusted(
         used = np.isfinite(placed.x_world).all(axis=(1, 2))
         _check_count(int(used.sum()), len(uv))
         scatter = (1e-3, 1e-3, 1e-4, 1e-4)[n] * length
-        problem = BarProblem(placed.uv[used], length, interiors=not known, sigma=sigma, scatter=scatter)
-        rig, x_world = problem.adjust(rig, placed.x_world[used], rounds=3 if n < 3 else 8, iterations=20)
-        sigma = problem.sigma
-    return problem.result(rig, x_world), placed.uv[used], used, placed.ambiguous
+        found = adjust_bar(
+            rig, placed.x_world[used], placed.uv[used], length, interiors=not known, sigma=sigma, scatter=scatter,
+            rounds=3 if n < 3 else 8, iterations=20,
+        )  # fmt: skip
+        rig, sigma = found[0].rig, found[2].sigma
+    return bar_bundle(*found), placed.uv[used], used, placed.ambiguous
 
 
 def _limit(rig: Rig, known: bool) -> float:
@@ -200,9 +202,11 @@ def _grown(rig: Rig, uv: NDArray, length: float, known: bool) -> tuple[Rig, floa
         used = np.isfinite(placed.x_world).all(axis=(1, 2))
         if used.sum() < MIN_PLACES:
             return rig, np.inf, 0.0
-        problem = BarProblem(placed.uv[used], length, interiors=not known, sigma=sigma, scatter=5e-3 * length)
-        rig, _ = problem.adjust(rig, placed.x_world[used], rounds=2, iterations=15)
-        sigma = problem.sigma
+        found = adjust_bar(
+            rig, placed.x_world[used], placed.uv[used], length, interiors=not known, sigma=sigma,
+            scatter=5e-3 * length, rounds=2, iterations=15,
+        )  # fmt: skip
+        rig, sigma = found[0].rig, found[2].sigma
         share = used.sum() / max(int((np.isfinite(uv).all(axis=(2, 3)).sum(axis=1) >= 2).sum()), 1)
     return rig, sigma, float(share)
 
@@ -221,8 +225,7 @@ def _check(bundle: BarBundle, length: float, known: bool, seen: Mapping[str, Bar
             f"the distance of the two targets scatters by {100 * bundle.scatter / length:.1f} % from place to place",
             remedy="Check that the videos are in step and the two brightest spots always on one stiff bar.",
         )
-    P = POSE + len(INTERIOR) * (not known)
-    std = np.sqrt(np.diag(bundle.covariance)).reshape(-1, P)
+    std = np.sqrt(np.einsum("cpcp->cp", bundle.covariance))
     for c, camera in enumerate(bundle.rig):
         used = int(np.isfinite(bundle.residuals[:, c]).all(axis=(1, 2)).sum())
         if used < MIN_PLACES:
@@ -230,10 +233,10 @@ def _check(bundle: BarBundle, length: float, known: bool, seen: Mapping[str, Bar
                 f"only {used} of its {len(seen[camera.name].ends)} images of the bar agree with the other cameras",
                 place=f"camera {camera.name}", remedy="Check that it is in step. Wave the bar in view of two cameras.",
             )  # fmt: skip
-        if not known and not std[c, POSE] < _MAX_RELATIVE_STD * camera.matrix[0, 0]:
+        if not known and not std[c, FOCAL] < _MAX_RELATIVE_STD * camera.matrix[0, 0]:
             raise CalibrationError(
                 f"the focal length is not determined: {camera.matrix[0, 0]:.0f} px may be off by "
-                f"{100 * std[c, POSE] / camera.matrix[0, 0]:.0f} %", place=f"camera {camera.name}",
+                f"{100 * std[c, FOCAL] / camera.matrix[0, 0]:.0f} %", place=f"camera {camera.name}",
                 remedy="Wave the bar near and far, in all directions, move the cameras apart, or give --interiors.",
             )  # fmt: skip
     farthest = max(float(np.linalg.norm(camera.centre_world)) for camera in bundle.rig)

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.calibration.bar.bundle import INTERIOR, POSE, BarBundle
+from kinefit.calibration.bar.bundle import INTERIOR, BarBundle
 from kinefit.calibration.bar.targets import BarViews
+from kinefit.calibration.board.intrinsics import coverage
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.se3 import log_so3
 
 _ADVISED_PLACES = 50  # of one camera; with fewer the distortion is poorly determined
 _ADVISED_COVERAGE = 0.4  # of the image
 _MAX_FOCAL_STD = 0.005  # of the focal length, without advice
-_COVERAGE_CELLS = 8  # along each side of the image
 _MAX_PRIOR = 0.5  # share of the information on a parameter; with more it is reported as an assumption
 
 
@@ -57,12 +57,10 @@ def reports_of(
     rig: Rig, bundle: BarBundle, uv: NDArray, seen: Mapping[str, BarViews], length: float, sigma: float
 ) -> dict[str, BarCameraReport]:
     """Reports of all cameras; rig in the final world, uv (F, C, 2, 2) [px], length and its sigma [m]."""
-    interior = len(bundle.covariance) // len(rig) - POSE
     out = {}
     for c, camera in enumerate(rig):
         old = bundle.rig.cameras[c]
-        own = slice(c * (POSE + interior), (c + 1) * (POSE + interior))
-        cov, share = bundle.covariance[own, own], bundle.prior_share[own]
+        cov, share = bundle.covariance[c, :, c], bundle.prior_share[c]
         # x' = exp(v, w) x in the camera: its centre moves by -Rᵀ v in the old world; rotated to the new one
         R_new = camera.T_world_camera[:3, :3]
         place_cov = R_new @ cov[:3, :3] @ R_new.T
@@ -70,8 +68,7 @@ def reports_of(
         turn = R_new @ old.T_camera_world[:3, :3]
         scaled = (sigma / length) * (turn @ baseline)
         std = np.concatenate([
-            np.sqrt(np.diag(cov)[POSE:]) if interior else np.zeros(len(INTERIOR)),
-            np.sqrt(np.diag(place_cov) + scaled**2), np.sqrt(np.diag(cov)[3:6]),
+            np.sqrt(np.diag(cov)[6:]), np.sqrt(np.diag(place_cov) + scaled**2), np.sqrt(np.diag(cov)[3:6]),
         ])  # fmt: skip
         distortion = np.zeros(5)
         distortion[: min(5, camera.distortion.size)] = camera.distortion[:5]
@@ -81,17 +78,12 @@ def reports_of(
         left = bundle.residuals[:, c]
         used = np.isfinite(left).all(axis=(1, 2))
         names = (*INTERIOR, "x", "y", "z", "rx", "ry", "rz")
-        assumed = tuple(name for name, part in zip(INTERIOR, share[POSE:]) if part > _MAX_PRIOR) if interior else ()
+        assumed = tuple(name for name, part in zip(INTERIOR[2:], share[8:]) if part > _MAX_PRIOR)
         out[camera.name] = BarCameraReport(
             float(np.sqrt(np.nanmean(left**2))), len(seen[camera.name].ends), int(used.sum()),
-            _coverage(uv[used, c].reshape(-1, 2), camera.size), names, values, std, assumed,
+            coverage(uv[used, c].reshape(-1, 2), camera.size), names, values, std, assumed,
         )
     return out
-
-
-def _coverage(uv: NDArray, size: tuple[int, int]) -> float:
-    cells = np.clip((uv + 0.5) / size * _COVERAGE_CELLS, 0, _COVERAGE_CELLS - 1).astype(int)
-    return len(np.unique(cells, axis=0)) / _COVERAGE_CELLS**2
 
 
 def advice_of(rig: Rig, reports: Mapping[str, BarCameraReport]) -> list[str]:

@@ -8,19 +8,21 @@ one image constrains the lens with full weight, and the relation between images 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.geometry import se3
-from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.camera import Rig
+from kinefit.losses import huber
+from kinefit.solvers.bundle.adjust import Bundle, BundleProblem, BundleState, adjust
 from kinefit.solvers.bundle.arrow import Arrow, assembled
-from kinefit.solvers.least_squares import descend
+from kinefit.solvers.bundle.cameras import ASPECT, CENTRE, COLUMNS, DISTORTION, FOCAL, POSE, CameraPrior, pixel_rows
 
-_POSE = 6  # parameters of a pose
-_HUBER_SIGMAS = 1.345  # 95 % efficient for normal errors (Huber, 1981)
+_LOSS = huber(1.345)  # 95 % efficient for normal errors (Huber, 1981)
 _CORNER_SIGMA_PX = 0.25  # along one axis, in sharp to slightly blurred images
 _INITIAL_JITTER = (3e-3, 6e-3)  # [m, rad] of a hand-held board and cameras some milliseconds apart
 _MIN_JITTER = (1e-5, 2e-5)  # [m, rad] no board is flatter
@@ -42,9 +44,9 @@ class Corners:
     x_board: NDArray
     uv: NDArray
 
-    def only(self, keep: NDArray) -> Corners:
-        """The corners selected by a mask (M,) bool."""
-        return Corners(self.camera[keep], self.frame[keep], self.x_board[keep], self.uv[keep])
+    def in_world(self, Ts_world_board: NDArray) -> NDArray:
+        """(M, 3) [m] the corners on boards at poses (F, 4, 4)."""
+        return se3.apply(Ts_world_board[self.frame], self.x_board)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,172 +88,92 @@ def adjust_boards(
     rounds : int
         Largest number of estimates of Σ (by expectation maximisation), each with a solve.
     """
-    jitter = _INITIAL_JITTER
+    prior, problem = _free(rig, interiors), BoardProblem(corners, _INITIAL_JITTER)
+    state = BundleState(rig, np.zeros(len(rig)), Ts_world_board)
     for _ in range(rounds):
-        problem = _BoardProblem(corners, interiors, jitter)
-        rig, Ts_world_board = problem.solve(rig, Ts_world_board, max_iterations)
-        before, jitter = jitter, problem.jitter_of(rig, Ts_world_board)
-        if all(abs(new / old - 1) < 0.05 for new, old in zip(jitter, before)):
+        found = adjust(state, prior, problem, iterations=max_iterations, tolerance=1e-6)
+        state, before, problem = found.state, problem.jitter, replace(problem, jitter=problem.jitter_of(found))
+        if all(abs(new / old - 1) < 0.05 for new, old in zip(problem.jitter, before)):
             break
-    problem = _BoardProblem(corners, interiors, jitter)
-    system = problem.system(rig, Ts_world_board)
-    position_std, focal_std = _deviations(system, len(rig))
-    left = residuals(rig, Ts_world_board, corners)
-    return BoardBundle(rig, Ts_world_board, left, system.within, jitter, position_std, focal_std)
+    found, std = adjust(state, prior, problem, iterations=0), np.zeros(prior.sigma.shape)
+    std[prior.free] = np.sqrt(np.diag(found.posterior.covariances()[0]))
+    residuals = corners.uv - state.rig.project(corners.in_world(state.blocks), corners.camera)
+    position_std, focal = np.linalg.norm(std[:, :3], axis=1), np.array([camera.matrix[0, 0] for camera in state.rig])
+    return BoardBundle(
+        state.rig, state.blocks, residuals, found.detail[0], problem.jitter, position_std, focal * std[:, FOCAL]
+    )
 
 
-def residuals(rig: Rig, Ts_world_board: NDArray, corners: Corners) -> NDArray:
-    """(M, 2) [px] measured minus projected; NaN behind a camera."""
-    T = Ts_world_board[corners.frame]
-    x_world = (T[:, :3, :3] @ corners.x_board[..., None])[..., 0] + T[:, :3, 3]
-    projected = np.empty(corners.uv.shape)
-    for c, camera in enumerate(rig):
-        own = corners.camera == c
-        projected[own] = camera.project(x_world[own])
-    return corners.uv - projected
-
-
-def interior_parameters(camera: Camera) -> int:
-    """Number of intrinsic parameters: fx, fy, cx, cy and the distortion."""
-    return 4 + camera.distortion.size
-
-
-def moved_camera(camera: Camera, delta: NDArray, interiors: bool) -> Camera:
-    """The camera changed by delta (6 + P,): a twist in its frame, then intrinsic parameters."""
-    T = se3.exp(delta[:_POSE]) @ camera.T_camera_world
-    T[:3, :3] = se3.nearest_rotation(T[:3, :3])
-    if not interiors:
-        return camera.with_pose(T)
-    d, K = delta[_POSE : _POSE + interior_parameters(camera)], np.array(camera.matrix)
-    K[[0, 1, 0, 1], [0, 1, 2, 2]] += d[:4]
-    return replace(camera, matrix=K, distortion=camera.distortion + d[4:], T_camera_world=T)
-
-
-def moved_rig(rig: Rig, delta: NDArray, interiors: bool) -> Rig:
-    """All cameras changed by delta (C · (6 + P),)."""
-    parts = zip(rig, delta.reshape(len(rig), -1))
-    return Rig(tuple(moved_camera(camera, d, interiors) for camera, d in parts))
-
-
-def pixel_columns(camera: Camera, x_camera: NDArray, interiors: bool) -> tuple[NDArray, NDArray, NDArray]:
-    """Pixels (M, 2), their derivatives by the point in the camera's frame (M, 2, 3) and by the interior (M, 2, P)."""
-    if not interiors:
-        at_origin = camera.with_pose(np.eye(4))
-        uv, J = at_origin.project_with_jacobian(x_camera)
-        return uv, J, np.zeros((len(x_camera), 2, 0))
-    k = camera.distortion if camera.distortion.size else np.zeros(4)
-    uv, jacobian = cv2.projectPoints(x_camera, np.zeros(3), np.zeros(3), camera.matrix, k)
-    J = jacobian.reshape(len(x_camera), 2, -1)
-    return uv.reshape(-1, 2), J[..., 3:6], J[..., 6 : 6 + interior_parameters(camera)]
+def _free(rig: Rig, interiors: bool) -> CameraPrior:
+    """No prior of the cameras, the first one's pose fixed."""
+    sigma = np.zeros((len(rig), COLUMNS))
+    sigma[1:, POSE] = np.inf
+    if interiors:
+        sigma[:, [FOCAL, ASPECT]] = sigma[:, CENTRE] = np.inf
+        for own, camera in zip(sigma[:, DISTORTION], rig):
+            own[: camera.distortion.size] = np.inf
+    return CameraPrior(rig, sigma)
 
 
 @dataclass(frozen=True, eq=False)
-class CameraEquations:
-    """Cameras, the unknowns of blocks, their arrow and cost; free: (n,) bool, the cameras' parameters that move."""
+class BoardProblem(BundleProblem):
+    """Corners of boards at poses (F, 4, 4), the blocks; views are runs of corners of one camera and frame.
 
-    rig: Rig
-    unknowns: NDArray
-    arrow: Arrow
-    free: NDArray
-    cost: float
+    Parameters
+    ----------
+    corners : Corners
+    jitter : (shift [m], turn [rad]) standard deviations of η
+    """
 
-    def covariances(self) -> tuple[NDArray, NDArray]:
-        """Covariances (N, N) of the cameras, zero for fixed parameters, and (F, 6, 6) of the frames' unknowns."""
-        cov, (blocks,) = self.arrow.covariances()
-        return np.where(np.outer(self.free, self.free), cov, 0.0), blocks
+    corners: Corners
+    jitter: tuple[float, float]
 
+    @cached_property
+    def precision(self) -> NDArray:
+        """(6,) of η."""
+        return np.repeat(1.0 / np.square(self.jitter), 3)
 
-@dataclass(frozen=True, eq=False)
-class _BoardEquations(CameraEquations):
-    within: NDArray
-    eta: NDArray  # (V, 6)
-    spread: NDArray  # (V, 6) variances of η
+    @cached_property
+    def starts(self) -> NDArray:
+        """(V,) first corner of each view."""
+        change = np.diff(self.corners.camera) | np.diff(self.corners.frame)
+        return np.concatenate([[0], np.flatnonzero(change) + 1])
 
+    def moved(self, state: BundleState, delta: NDArray, moves: Sequence[NDArray]) -> BundleState:
+        """The state with moved boards."""
+        return replace(state, blocks=state.blocks @ se3.exp(moves[0]))
 
-class _BoardProblem:
-    """The corners, the free parameters, and Σ; views are runs of corners of one camera and frame."""
-
-    def __init__(self, corners: Corners, interiors: bool, jitter: tuple[float, float]) -> None:
-        self.corners, self.interiors = corners, interiors
-        self.precision = np.repeat(1.0 / np.square(jitter), 3)
-        change = np.flatnonzero(np.diff(corners.camera) | np.diff(corners.frame)) + 1
-        starts = np.concatenate([[0], change])
-        self.views = list(zip(starts, np.append(change, len(corners.camera))))
-        self.camera, self.frame = corners.camera[starts], corners.frame[starts]
-        self.sigma = _CORNER_SIGMA_PX
-
-    def solve(self, rig: Rig, Ts_world_board: NDArray, max_iterations: int) -> tuple[Rig, NDArray]:
-        """Minimise the cost by damped Gauss-Newton."""
-
-        def follow(at: _BoardEquations, move: tuple[NDArray, list[NDArray]]) -> _BoardEquations:
-            boards = np.stack([T @ se3.exp(d) for T, d in zip(at.unknowns, move[1][0])])
-            return self.system(moved_rig(at.rig, move[0], self.interiors), boards)
-
-        end = descend(
-            self.system(rig, Ts_world_board), lambda at, damping: at.arrow.relative_step(damping), follow,
-            iterations=max_iterations, damping=1e-3, tolerance=1e-6,
-        ).at  # fmt: skip
-        return end.rig, end.unknowns
-
-    def jitter_of(self, rig: Rig, Ts_world_board: NDArray) -> tuple[float, float]:
+    def jitter_of(self, found: Bundle) -> tuple[float, float]:
         """Standard deviations (shift, turn) of η over the views of frames shared by two or more cameras."""
-        system = self.system(rig, Ts_world_board)
-        count = np.bincount(self.frame, minlength=len(Ts_world_board))[self.frame]
+        frame = self.corners.frame[self.starts]
+        count = np.bincount(frame)[frame]
         if not (count > 1).any():
             return _MIN_JITTER
         # The frame's pose absorbs one view's freedom. Medians: a wrong view must not weaken all others.
-        second = (system.eta**2 + system.spread)[count > 1] * (count / np.maximum(count - 1, 1))[count > 1, None]
+        square = found.detail[1] ** 2 + found.detail[2]
+        second = square[count > 1] * (count / np.maximum(count - 1, 1))[count > 1, None]
         shift, turn = (float(np.sqrt(np.median(second[:, part].mean(axis=1)))) for part in (slice(0, 3), slice(3, 6)))
         return max(shift, _MIN_JITTER[0]), max(turn, _MIN_JITTER[1])
 
-    def system(self, rig: Rig, Ts: NDArray) -> _BoardEquations:
-        """Linearise at a rig and board poses (F, 4, 4)."""
-        corners, C, F, V = self.corners, len(rig), len(Ts), len(self.views)
-        P = _POSE + max(interior_parameters(camera) for camera in rig) * self.interiors
-        free = np.zeros((C, P), bool)
-        free[1:, :_POSE] = True
-        G = np.zeros((len(corners.uv), 2, P + 7))  # camera, board, residual
-        for c, camera in enumerate(rig):
-            own = corners.camera == c
-            x_board, T = corners.x_board[own], camera.T_camera_world @ Ts[corners.frame[own]]
-            x = (T[:, :3, :3] @ x_board[..., None])[..., 0] + T[:, :3, 3]
-            uv, J, J_interior = pixel_columns(camera, x, self.interiors)
-            free[c, _POSE : _POSE + J_interior.shape[2]] = True
-            JR, part = J @ T[:, :3, :3], np.zeros((len(x), 2, P + 7))
-            part[..., :_POSE] = np.concatenate([J, np.cross(x[:, None], J)], axis=2)
-            part[..., _POSE : _POSE + J_interior.shape[2]] = J_interior
-            part[..., :P] *= free[c]
-            part[..., P:-1] = np.concatenate([JR, np.cross(x_board[:, None], JR)], axis=2)
-            part[..., -1] = corners.uv[own] - uv
-            G[own] = np.where(np.isfinite(part).all(axis=(1, 2), keepdims=True) & (x[:, 2, None, None] > 0), part, 0.0)
-        grams, cost, within = np.empty((V, P + 7, P + 7)), 0.0, np.zeros(corners.uv.shape)
-        eta, spread = np.zeros((V, 6)), np.zeros((V, 6))
-        for v, (start, stop) in enumerate(self.views):
-            grams[v], within[start:stop], eta[v], spread[v], more = self._view(G[start:stop], P)
-            cost += more
-        arrow = assembled(grams, self.camera, self.frame, C, F, _POSE)
-        arrow = arrow.with_prior((~free.ravel()).astype(float), np.zeros(free.size))
-        return _BoardEquations(rig, Ts, arrow, free.ravel(), cost, within, eta, spread)
-
-    def _view(self, G: NDArray, P: int) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
-        """One view's equations with η eliminated; its residuals at the best η, η, its variances, the cost."""
-        w, board, left = np.ones(len(G)), G[..., P:-1], G[..., -1]
+    def linearised(self, state: BundleState, prior: CameraPrior) -> tuple[Arrow, float, tuple[NDArray, ...]]:
+        """Equations, η of each view eliminated; cost; residuals (M, 2) [px] at the best η, η (V, 6), its variances."""
+        corners, starts, Ts, board = self.corners, self.starts, state.blocks, slice(-7, -1)
+        R = Ts[corners.frame, :3, :3]
+        by_board = np.concatenate([R, -R @ se3.hat(corners.x_board)], axis=2)
+        rows = pixel_rows(state.rig, prior, corners.camera, corners.in_world(Ts), corners.uv, by_block=by_board)
+        rows[~np.isfinite(rows[..., -1]).all(axis=1)] = 0.0
+        counts = np.diff([*starts, len(rows)])
+        of_view = np.repeat(np.arange(len(starts)), counts), np.arange(len(rows)) - np.repeat(starts, counts)
+        G, w = np.zeros((len(starts), counts.max(), *rows.shape[1:])), np.ones((len(starts), counts.max()))
+        G[of_view] = rows  # views of few corners end with zeros
+        flat = G.reshape(len(G), -1, G.shape[3])
         for _ in range(2):
-            WG = (w / self.sigma**2)[:, None, None] * G
-            M = WG.reshape(-1, P + 7).T @ G.reshape(-1, P + 7)
-            inverse = np.linalg.inv(M[P:-1, P:-1] + np.diag(self.precision))
-            eta = inverse @ M[P:-1, -1]
-            rest = left - board @ eta
-            size = np.linalg.norm(rest, axis=1) / self.sigma
-            w = np.minimum(1.0, _HUBER_SIGMAS / np.maximum(size, 1e-12))
-        M -= M[:, P:-1] @ inverse @ M[P:-1]
-        huber = np.where(size < _HUBER_SIGMAS, size**2, _HUBER_SIGMAS * (2 * size - _HUBER_SIGMAS))
-        cost = np.sum(huber) + eta @ (self.precision * eta)
-        return M, rest, eta, np.diag(inverse), float(cost)
-
-
-def _deviations(system: _BoardEquations, cameras: int) -> tuple[NDArray, NDArray]:
-    """Standard deviations of the cameras' centres (C,) [m] and focal lengths (C,) [px]."""
-    variance = np.diag(system.covariances()[0]).reshape(cameras, -1)
-    focal = variance[:, _POSE] if variance.shape[1] > _POSE else np.zeros(cameras)
-    return np.sqrt(variance[:, :3].sum(axis=1)), np.sqrt(focal)
+            M = flat.swapaxes(1, 2) @ ((w / _CORNER_SIGMA_PX**2).repeat(2, axis=1)[..., None] * flat)
+            inverse = np.linalg.inv(M[:, board, board] + np.diag(self.precision))
+            eta = inverse @ M[:, board, -1:]
+            residuals = G[..., -1] - (flat[..., board] @ eta).reshape(G.shape[:3])
+            rho, w = _LOSS.weigh(np.sum(residuals**2, axis=2) / _CORNER_SIGMA_PX**2)
+        M -= M[:, :, board] @ inverse @ M[:, board]
+        cost = float(rho.sum() + np.sum(eta[..., 0] ** 2 @ self.precision))
+        arrow = assembled(M, corners.camera[starts], corners.frame[starts], prior.free, len(Ts))
+        return arrow, cost, (residuals[of_view], eta[..., 0], np.einsum("vii->vi", inverse))

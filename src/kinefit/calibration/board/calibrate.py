@@ -187,7 +187,7 @@ def _report(
     used = len(np.unique(placed.corners.frame[own]))
     return BoardCameraReport(
         _rms(bundle.residuals[own]), _rms(bundle.within[own]), len(seen.views),
-        len(single.frames) if single else used, coverage(seen), float(bundle.focal_std[c]),
+        len(single.frames) if single else used, coverage(seen.uv, seen.size), float(bundle.focal_std[c]),
         float(bundle.position_std[c]),
     )
 

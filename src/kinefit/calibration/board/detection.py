@@ -145,6 +145,11 @@ class CameraViews:
         """{frame: view}."""
         return {view.frame: view for view in self.views}
 
+    @property
+    def uv(self) -> NDArray:
+        """(M, 2) [px] of all corners."""
+        return np.concatenate([np.zeros((0, 2)), *(view.uv for view in self.views)])
+
 
 class Finder:
     """Finder of one board in images; remembers whether it is printed white on black.

@@ -78,15 +78,12 @@ def calibrate_interiors(name: str, seen: CameraViews, board: Board) -> Interiors
         )
     used = 5 if not flags & cv2.CALIB_FIX_K3 else 4
     camera = Camera(name, seen.size, K, k[:used], "radtan")
-    return Interiors(camera, rms, std, coverage(seen), tilt, tuple(view.frame for view in views))
+    return Interiors(camera, rms, std, coverage(seen.uv, seen.size), tilt, tuple(view.frame for view in views))
 
 
-def coverage(seen: CameraViews) -> float:
-    """Share 0..1 of the cells of a grid (8, 8) over the image in which a corner was detected."""
-    if not seen.views:
-        return 0.0
-    uv = np.concatenate([view.uv for view in seen.views])
-    cells = np.clip((uv + 0.5) / seen.size * _COVERAGE_CELLS, 0, _COVERAGE_CELLS - 1).astype(int)
+def coverage(uv: NDArray, size: tuple[int, int]) -> float:
+    """Share 0..1 of the cells of a grid (8, 8) over an image with a pixel of uv (N, 2)."""
+    cells = np.clip((uv + 0.5) / size * _COVERAGE_CELLS, 0, _COVERAGE_CELLS - 1).astype(int)
     return len(np.unique(cells, axis=0)) / _COVERAGE_CELLS**2
 
 

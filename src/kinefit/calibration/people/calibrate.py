@@ -25,7 +25,8 @@ from kinefit.geometry.lines import triangulate, triangulate_robust
 from kinefit.multiview.association import person_records
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.sensors.channels import Channels, make_channels
-from kinefit.solvers.bundle.body_bundle import BundleState, adjust
+from kinefit.solvers.bundle.adjust import BundleState, adjust
+from kinefit.solvers.bundle.body_bundle import PointProblem
 from kinefit.solvers.bundle.cameras import FOCAL, TIME, CameraPrior, PointPixels
 
 _MIN_CONFIDENCE = 0.3  # confidence of a keypoint that takes part in the start
@@ -183,8 +184,8 @@ def _adjusted(
         prior_std[:, FOCAL] = focal / np.sqrt(_CORRELATED_PIXELS)
         prior_std[1:, TIME] = clock
         mean = Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True)))
-        bundle = adjust(BundleState(rig, offsets, x[good]), CameraPrior(mean, prior_std), pixels)
-        rig, offsets = bundle.rig, bundle.offsets
+        found = adjust(BundleState(rig, offsets, x[good]), CameraPrior(mean, prior_std), PointProblem(pixels)).state
+        rig, offsets = found.rig, found.offsets
     first = people[0].reshape(-1, len(rig), 2)
     x = triangulate_robust(rig, first, max_residual_px=_MAX_RAY_SIGMAS * sigma)[0]
     return rig, x.reshape(*people[0].shape[:2], 3)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.solvers.bundle.cameras import COLUMNS, POSE
+from kinefit.solvers.bundle.cameras import COLUMNS, POSE, departure
 
 _PLACE_SIGMA = 0.05  # [m] of a camera's centre, that weighs as much as
 _TURN_SIGMA = np.radians(1.0)  # of its rotation: at a distance of 3 m
@@ -24,7 +24,7 @@ def resized(rig: Rig, factor: float) -> Rig:
 
 
 def generators(rig: Rig) -> NDArray:
-    """(C · 10, 7) derivatives of the cameras' parameters by a twist (v, ω) and the scale of the world, images fixed."""
+    """(C · 16, 7) derivatives of the cameras' parameters by a twist (v, ω) and the scale of the world, images fixed."""
     out = np.zeros((len(rig), COLUMNS, 7))
     for block, camera in zip(out, rig, strict=True):
         block[POSE, :6] = -se3.adjoint(camera.T_camera_world)
@@ -49,11 +49,8 @@ def aligned(rig: Rig, old: Rig, *, scale: bool = True) -> tuple[Rig, NDArray, fl
     weight = _gauge_weight(len(rig))
     for _ in range(20):
         now = resized(rig, factor).moved(T)
-        away = np.zeros((len(rig), COLUMNS))
-        for row, a, b in zip(away, now, old, strict=True):
-            row[POSE] = se3.log(b.T_camera_world @ a.T_world_camera)
-        G = generators(now)[:, : 7 if scale else 6]
-        step = np.linalg.lstsq(np.sqrt(weight)[:, None] * G, np.sqrt(weight) * away.ravel(), rcond=1e-12)[0]
+        G, away = generators(now)[:, : 7 if scale else 6], departure(old, now).ravel()
+        step = np.linalg.lstsq(np.sqrt(weight)[:, None] * G, np.sqrt(weight) * away, rcond=1e-12)[0]
         grow = float(np.exp(step[6])) if scale else 1.0
         T[:3, 3] *= grow
         T, factor = se3.exp(step[:6]) @ T, factor * grow
@@ -75,9 +72,9 @@ def _by_centres(rig: Rig, old: Rig) -> tuple[NDArray, float]:
 
 
 def covariance_in_gauge(rig: Rig, S: NDArray, free: NDArray) -> NDArray:
-    """(C · 10, C · 10) covariance of the cameras' parameters in the gauge of `aligned`, from their information S.
+    """(C · 16, C · 16) covariance of the cameras' parameters in the gauge of `aligned`, from their information S.
 
-    free (C · 10,) bool: estimated parameters; all others have zero. Undetermined directions are large, not infinite.
+    free (C · 16,) bool: estimated parameters; all others have zero. Undetermined directions are large, not infinite.
     """
     G, W = generators(rig), _gauge_weight(len(rig))
     G = G * free[:, None]

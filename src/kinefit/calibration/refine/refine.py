@@ -26,7 +26,8 @@ from kinefit.errors import CalibrationError, ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.lines import triangulate
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
-from kinefit.solvers.bundle.body_bundle import BundleState, adjust
+from kinefit.solvers.bundle.adjust import BundleState, adjust
+from kinefit.solvers.bundle.body_bundle import BodyProblem
 from kinefit.solvers.bundle.cameras import COLUMNS, FOCAL, POSE, RADIAL, TIME, CameraPrior, PointPixels, departure
 
 PLACE_SIGMA = 0.05
@@ -109,7 +110,7 @@ def refine(
 
 
 def prior_sigma(cameras: int, *, focal: bool, distortion: bool, time_offsets: bool) -> NDArray:
-    """(C, 10) prior standard deviations of each parameter of calibrated cameras; 0 fixes a parameter."""
+    """(C, 16) prior standard deviations of each parameter of calibrated cameras; 0 fixes a parameter."""
     prior_std = np.zeros((cameras, COLUMNS))
     prior_std[:, :3], prior_std[:, 3:6] = PLACE_SIGMA, TURN_SIGMA
     prior_std[:, FOCAL] = _FOCAL_SIGMA * focal
@@ -135,7 +136,7 @@ def refine_from(
         static = PointPixels(*map(np.concatenate, both))
     offsets = np.zeros(len(rig))
     first: PersonSighting | None = None
-    rounds = _MAX_CLOCK_ROUNDS if prior.freedom[:, TIME].any() else _MAX_ROUNDS
+    rounds = _MAX_CLOCK_ROUNDS if prior.free[:, TIME].any() else _MAX_ROUNDS
     for turn in range(rounds):
         step("refining", turn, rounds + 1)
         seen = _sight(rig, trial, offsets)
@@ -148,18 +149,17 @@ def refine_from(
         pixels, (model, theta) = pixel_frames(seen, chosen), body_model(seen, trial.body)
         states = [seen.motion.state(int(f)) for f in chosen]
         start = BundleState(rig, np.zeros(len(rig)), static_start(rig, static), theta, states)
-        bundle = adjust(
-            start, prior, static, model=model, frames=pixels, max_iterations=20, tolerance=1e-3
-        )  # fmt: skip
-        change = np.abs(departure(bundle.rig, rig)[:, POSE]).max(), np.abs(np.ptp(bundle.offsets))
-        rig, offsets = bundle.rig, offsets + bundle.offsets
+        problem = BodyProblem(static, model=model, frames=pixels)
+        bundle = adjust(start, prior, problem, iterations=20, tolerance=1e-3)
+        change = np.abs(departure(bundle.state.rig, rig)[:, POSE]).max(), np.abs(np.ptp(bundle.state.offsets))
+        rig, offsets = bundle.state.rig, offsets + bundle.state.offsets
         offsets = offsets - offsets[0]
         if change[0] < _CONVERGED_STEP and change[1] * seen.motion.rate < _CONVERGED_FRAMES:
             break
     else:  # the last adjustment may have changed the scale, which the gauge takes from the person
         seen = _sight(rig, trial, offsets)
     step("refining", rounds, rounds + 1)
-    covariance = chance(bundle, prior, seen, chosen) + bias(model, bundle, pixels, prior, static)
+    covariance = chance(bundle, seen, chosen) + bias(problem, bundle)
     rig, rule = gauge(rig, seen)
     last = _sight(rig, trial, offsets)
     assert first is not None

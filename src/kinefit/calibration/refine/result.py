@@ -12,9 +12,9 @@ from kinefit.calibration.refine.gauge import aligned, covariance_in_gauge
 from kinefit.calibration.refine.sightings import PersonSighting, correlation_time
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
-from kinefit.solvers.bundle.body_bundle import Bundle, BundleState, adjust
-from kinefit.solvers.bundle.cameras import COLUMNS, FOCAL, TIME, CameraPrior, PointPixels, camera_jacobian, departure
-from kinefit.solvers.bundle.shape import PixelFrames, ShapeParameters
+from kinefit.solvers.bundle.adjust import Bundle, BundleState, adjust
+from kinefit.solvers.bundle.body_bundle import BodyProblem
+from kinefit.solvers.bundle.cameras import COLUMNS, FOCAL, TIME, camera_jacobian, departure
 
 MAX_STATIC_SIGMA_PX = 3.0
 """Standard deviation of a static point's residual near the person, up to which a rig is reliable."""
@@ -108,7 +108,7 @@ def changes_of(
 ) -> tuple[dict[str, CameraChange], float]:
     """Change of each camera, and the standard deviation [m] of a triangulated point.
 
-    covariance (C · 10, C · 10) is of the cameras' parameters, offsets (C,) [s] of their clocks.
+    covariance (C · 16, C · 16) is of the cameras' parameters, offsets (C,) [s] of their clocks.
     """
     clock = np.zeros((len(rig), len(covariance)))  # relative to the first camera: a common delay has no effect
     clock[np.arange(len(rig)), np.arange(TIME, len(covariance), COLUMNS)] = 1.0
@@ -150,7 +150,7 @@ def places(motion: Motion) -> NDArray:
 def expected_errors(rig: Rig, covariance: NDArray, x_world: NDArray) -> tuple[NDArray, float]:
     """Standard deviations of triangulated static points (P, 3) [m], median over the points.
 
-    covariance (C · 10, C · 10) is of the cameras. Returns (C,) [px] those of the residual in each camera, and [m] that
+    covariance (C · 16, C · 16) is of the cameras. Returns (C,) [px] those of the residual in each camera, and [m] that
     of the point.
     """
     J_camera = np.stack([camera_jacobian(camera, x_world) for camera in rig], axis=1)
@@ -179,8 +179,8 @@ def expected_errors(rig: Rig, covariance: NDArray, x_world: NDArray) -> tuple[ND
 _MAX_JACKKNIFE_FRAMES = 40
 
 
-def chance(bundle: Bundle, prior: CameraPrior, seen: PersonSighting, frames: NDArray) -> NDArray:
-    """Covariance (C · 10, C · 10) of the cameras from random errors.
+def chance(bundle: Bundle, seen: PersonSighting, frames: NDArray) -> NDArray:
+    """Covariance (C · 16, C · 16) of the cameras from random errors.
 
     Their variance and correlation time are those of the residuals without each channel's mean.
     """
@@ -190,37 +190,33 @@ def chance(bundle: Bundle, prior: CameraPrior, seen: PersonSighting, frames: NDA
     new = min(1.0, len(values) / max(len(frames), 1) / correlation_time(values - mean))  # independent share of frames
     share = seen.confidence / np.square(seen.channels.sigma)
     power = float(np.nanmean(np.sum((values - mean) ** 2, axis=-1) * share)) / 2.0
-    free = prior.freedom.ravel() > 0
-    return covariance_in_gauge(bundle.rig, bundle.S * new / max(power, 1e-12), free)
+    return covariance_in_gauge(bundle.state.rig, bundle.S * new / max(power, 1e-12), bundle.prior.free.ravel())
 
 
-def bias(
-    model: ShapeParameters, bundle: Bundle, frames: PixelFrames, prior: CameraPrior, static: PointPixels
-) -> NDArray:
-    """Covariance (C · 10, C · 10) of the cameras from systematic errors.
+def bias(problem: BodyProblem, bundle: Bundle) -> NDArray:
+    """Covariance (C · 16, C · 16) of the cameras from systematic errors.
 
     A detector's points are biased against the anatomical ones, differently in each view. Grouped jackknife (M.
     Quenouille, 1956; J. Tukey, 1958): fit the cameras without the points of each segment in turn.
     """
+    frames, state = problem.frames, bundle.state
     some = np.unique(np.linspace(0, len(frames.uv) - 1, min(_MAX_JACKKNIFE_FRAMES, len(frames.uv))).astype(int))
     owner = frames.points.segments[frames.column]
     groups = np.unique(owner)
 
-    def fit(start: BundleState, without: int | None) -> Bundle:
+    def fit(start: BundleState, without: int | None) -> BundleState:
         kept = np.ones(len(owner)) if without is None else (owner != without).astype(float)
-        velocity = None if frames.velocity is None else frames.velocity[some]
-        part = replace(frames, uv=frames.uv[some], weight=frames.weight[some] * kept, velocity=velocity)
-        start = replace(start, offsets=bundle.offsets)
-        return adjust(
-            start, prior, static, model=model, frames=part, max_iterations=6, tolerance=1e-3
-        )  # fmt: skip
+        weight, velocity = frames.weight[some] * kept, frames.velocity[some]
+        part = replace(frames, uv=frames.uv[some], weight=weight, velocity=velocity)
+        start = replace(start, offsets=state.offsets)
+        return adjust(start, bundle.prior, replace(problem, frames=part), iterations=6, tolerance=1e-3).state
 
-    whole = fit(replace(bundle, states=[bundle.states[f] for f in some]), None)
+    whole = fit(replace(state, states=[state.states[f] for f in some]), None)
     away = []
     for group in groups:
         part = fit(whole, int(group))
         row = departure(aligned(part.rig, whole.rig)[0], whole.rig)
-        row[:, -1] = part.offsets - whole.offsets
+        row[:, TIME] = part.offsets - whole.offsets
         away.append(row.ravel())
     spread = np.array(away) - np.mean(away, axis=0)
     return (len(groups) - 1) / len(groups) * spread.T @ spread

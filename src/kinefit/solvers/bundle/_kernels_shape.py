@@ -25,64 +25,18 @@ def scale_motion(parents, offsets, groups, frames, motion):
 
 
 @jit
-def pose_and_shape_columns(
-    x, y, z, ux, uy, uz, vx, vy, vz, s, k, n, n_groups, dof_parent, last_dof, groups, base, shift, mirror, motion,
-    frames, screws, centre, index, ju, jv,
-):  # fmt: skip
-    """Derivatives ju, jv of one pixel by degrees of freedom and shape, their places in index; returns how many."""
-    count = 0
-    dx, dy, dz = x - centre[0], y - centre[1], z - centre[2]
-    d = last_dof[s]
-    while d >= 0:
-        if d >= 6:
-            t = screws[d - 6]
-            vx_, vy_, vz_ = t[0], t[1], t[2]
-            wx, wy, wz = t[3], t[4], t[5]
-        else:
-            vx_, vy_, vz_ = (1.0 if d == 0 else 0.0), (1.0 if d == 1 else 0.0), (1.0 if d == 2 else 0.0)
-            wx, wy, wz = (1.0 if d == 3 else 0.0), (1.0 if d == 4 else 0.0), (1.0 if d == 5 else 0.0)
-        mx, my, mz = vx_ + wy * dz - wz * dy, vy_ + wz * dx - wx * dz, vz_ + wx * dy - wy * dx
-        index[count] = d
-        ju[count] = ux * mx + uy * my + uz * mz
-        jv[count] = vx * mx + vy * my + vz * mz
-        count += 1
-        d = dof_parent[d]
-    f = frames[s]
-    for q in range(n_groups):
-        mx, my, mz = motion[s, q, 0], motion[s, q, 1], motion[s, q, 2]
-        if q == groups[s]:
-            mx += f[0] * base[k, 0] + f[1] * base[k, 1] + f[2] * base[k, 2]
-            my += f[3] * base[k, 0] + f[4] * base[k, 1] + f[5] * base[k, 2]
-            mz += f[6] * base[k, 0] + f[7] * base[k, 1] + f[8] * base[k, 2]
-        if mx != 0.0 or my != 0.0 or mz != 0.0:
-            index[count] = n + q
-            ju[count] = ux * mx + uy * my + uz * mz
-            jv[count] = vx * mx + vy * my + vz * mz
-            count += 1
-    if shift[k] >= 0:
-        for i in range(3):
-            sign = mirror[k] if i == 2 else 1.0
-            mx, my, mz = sign * f[i], sign * f[3 + i], sign * f[6 + i]
-            index[count] = n + n_groups + shift[k] + i
-            ju[count] = ux * mx + uy * my + uz * mz
-            jv[count] = vx * mx + vy * my + vz * mz
-            count += 1
-    return count
-
-
-@jit
 def frame_system(
     parents, dof_parent, last_dof, offsets, groups, n_groups,
     owner, rest, base, shift, mirror, cameras, camera, column, target, weight, share,
-    frames, screws, centre, kind, scale, freedom, first, velocity, H, g,
+    frames, screws, centre, kind, scale, place_of, velocity, H, g,
 ):  # fmt: skip
     """Add one frame's pixels to H (m, m; lower triangle) and g (m,): dofs, scales, point shifts, cameras.
 
     owner (K,), rest (K, 3): points of the body; base (K, 3): their place in the segment before scaling; shift (K,):
-    first shift parameter of each point, -1 for none; mirror (K,): -1 where the shift counts mirrored in z.
+    first shift parameter of each point; mirror (K,): -1 where the shift counts mirrored in z.
     Measurements: camera (N,), column (N,) point, target (N, 2) [px], weight (N,) [1/px²],
-    share (N,) of it that counts beyond the loss. Cameras: freedom (C, 10) of
-    their parameters, first parameter's place (-1: cameras are fixed), velocity (N, 2) [px/s]. Returns the robust cost.
+    share (N,) of it that counts beyond the loss. Cameras: place_of (C, 16) their parameters in g, -1 for fixed ones;
+    velocity (N, 2) [px/s]. Returns the robust cost.
     """
     n = screws.shape[0] + 6
     motion = np.empty((parents.size, n_groups, 3))
@@ -106,20 +60,42 @@ def frame_system(
         w *= factor * share[m]
         if w <= 0.0:
             continue
-        s = owner[k]
-        count = pose_and_shape_columns(
-            x, y, z, ux, uy, uz, vx, vy, vz, s, k, n, n_groups, dof_parent, last_dof, groups, base, shift, mirror,
-            motion, frames, screws, centre, index, ju, jv,
-        )  # fmt: skip
-        if first >= 0:
-            c = camera[m]
-            camera_columns(
-                cameras[c], freedom[c], velocity[m], x, y, z, u, v, ux, uy, uz, vx, vy, vz, cu, cv
-            )
-            for i in range(COLUMNS):
-                if freedom[c, i] > 0.0:
-                    index[count], ju[count], jv[count] = first + c * COLUMNS + i, cu[i], cv[i]
-                    count += 1
+        s, count = owner[k], 0
+        dx, dy, dz = x - centre[0], y - centre[1], z - centre[2]
+        d = last_dof[s]
+        while d >= 0:
+            if d >= 6:
+                t = screws[d - 6]
+                mx, my, mz = t[0] + t[4] * dz - t[5] * dy, t[1] + t[5] * dx - t[3] * dz, t[2] + t[3] * dy - t[4] * dx
+            elif d >= 3:
+                mx, my, mz = (0.0, -dz, dy) if d == 3 else (dz, 0.0, -dx) if d == 4 else (-dy, dx, 0.0)
+            else:
+                mx, my, mz = (1.0 if d == 0 else 0.0), (1.0 if d == 1 else 0.0), (1.0 if d == 2 else 0.0)
+            index[count], ju[count], jv[count] = d, ux * mx + uy * my + uz * mz, vx * mx + vy * my + vz * mz
+            count += 1
+            d = dof_parent[d]
+        f = frames[s]
+        for q in range(n_groups):
+            mx, my, mz = motion[s, q, 0], motion[s, q, 1], motion[s, q, 2]
+            if q == groups[s]:
+                mx += f[0] * base[k, 0] + f[1] * base[k, 1] + f[2] * base[k, 2]
+                my += f[3] * base[k, 0] + f[4] * base[k, 1] + f[5] * base[k, 2]
+                mz += f[6] * base[k, 0] + f[7] * base[k, 1] + f[8] * base[k, 2]
+            if mx != 0.0 or my != 0.0 or mz != 0.0:
+                index[count], ju[count], jv[count] = n + q, ux * mx + uy * my + uz * mz, vx * mx + vy * my + vz * mz
+                count += 1
+        for i in range(3):
+            sign = mirror[k] if i == 2 else 1.0
+            mx, my, mz = sign * f[i], sign * f[3 + i], sign * f[6 + i]
+            index[count] = n + n_groups + shift[k] + i
+            ju[count], jv[count] = ux * mx + uy * my + uz * mz, vx * mx + vy * my + vz * mz
+            count += 1
+        c = camera[m]
+        camera_columns(cameras[c], velocity[m], x, y, z, u, v, ux, uy, uz, vx, vy, vz, cu, cv)
+        for i in range(COLUMNS):
+            if place_of[c, i] >= 0:
+                index[count], ju[count], jv[count] = place_of[c, i], cu[i], cv[i]
+                count += 1
         for a in range(count):
             ia = index[a]
             wu, wv = w * ju[a], w * jv[a]

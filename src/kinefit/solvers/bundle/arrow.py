@@ -101,22 +101,26 @@ def _scale(S: NDArray) -> NDArray:
     return 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
 
 
-def assembled(grams: NDArray, camera: NDArray, block: NDArray, cameras: int, blocks: int, size: int) -> Arrow:
-    """The arrow of C cameras with P parameters each, and of F blocks of `size` unknowns.
+def assembled(grams: NDArray, camera: NDArray, block: NDArray, free: NDArray, blocks: int) -> Arrow:
+    """The arrow of the free parameters of C cameras, and of F blocks of n unknowns.
 
     Parameters
     ----------
-    grams : (K, P + n + 1, P + n + 1) products Aᵀ W A, A = [derivatives by the camera, by the block, residual]
-    camera, block : (K,) int, of each measurement
+    grams : (K, P + n + 1, P + n + 1) products Aᵀ W A, A = [derivatives by the camera, by the block, residual], with
+        the P parameters that are free in one camera or more
+    camera, block : (K,) int, of each product
+    free : (C, N) bool, of all parameters
     """
-    P, (C, F) = grams.shape[1] - size - 1, (cameras, blocks)
-    H, g = np.zeros((C, P, C, P)), _summed(grams[:, :P, -1], camera, C)
+    free = free[:, free.any(axis=0)]
+    (C, P), F, size = free.shape, blocks, grams.shape[1] - free.shape[1] - 1
+    H, g, own = np.zeros((C, P, C, P)), _summed(grams[:, :P, -1], camera, C), free.ravel()
     H[range(C), :, range(C)] = _summed(grams[:, :P, :P], camera, C)
     B = _summed(grams[:, P:-1, :P], block * C + camera, F * C).reshape(F, C, size, P).swapaxes(1, 2)
-    own = Blocks(
-        _summed(grams[:, P:-1, P:-1], block, F), _summed(grams[:, P:-1, -1], block, F), B.reshape(F, size, C * P)
-    )
-    return Arrow(H.reshape(C * P, C * P), g.ravel(), (own,))
+    of_blocks = Blocks(
+        _summed(grams[:, P:-1, P:-1], block, F), _summed(grams[:, P:-1, -1], block, F),
+        B.reshape(F, size, C * P)[..., own],
+    )  # fmt: skip
+    return Arrow(H.reshape(C * P, C * P)[np.ix_(own, own)], g.ravel()[own], (of_blocks,))
 
 
 def _summed(values: NDArray, group: NDArray, groups: int) -> NDArray:

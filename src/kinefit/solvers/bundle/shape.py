@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.geometry.camera import Rig
-from kinefit.losses import SQUARED, Loss
+from kinefit.losses import Loss
 from kinefit.solvers.bundle import _kernels_shape
 
 _MIDLINE_STD = 0.002  # [m] of a midline point to either side
@@ -34,9 +34,9 @@ class PixelFrames:
     column : (N,) int, which of the K points
     uv : (F, N, 2) [px]
     weight : (F, N) [1/px²], 0 where undetected
-    share : (N,) in 0..1, optional
+    share : (N,) in 0..1
         Factor on a measurement's cost: below 1 for points with correlated errors.
-    velocity : (F, N, 2) [px/s] of the pixels, if time offsets are estimated; default: 0
+    velocity : (F, N, 2) [px/s] of the pixels, for time offsets
     """
 
     points: PointSet
@@ -44,17 +44,12 @@ class PixelFrames:
     column: NDArray
     uv: NDArray
     weight: NDArray
-    share: NDArray | None = None
-    velocity: NDArray | None = None
+    share: NDArray
+    velocity: NDArray
 
     def with_offsets(self, offsets: NDArray) -> PixelFrames:
         """The pixels corrected for clocks of cameras that are late by `offsets` (C,) [s]."""
-        return self if self.velocity is None else replace(self, uv=self.uv - offsets[self.camera, None] * self.velocity)
-
-    @property
-    def shares(self) -> NDArray:
-        """(N,) the share, 1 by default."""
-        return np.ones(len(self.column)) if self.share is None else self.share
+        return replace(self, uv=self.uv - offsets[self.camera, None] * self.velocity)
 
 
 @lru_cache(maxsize=32)  # every kind of parameters calls it again
@@ -115,26 +110,24 @@ class ShapeParameters:
         return scaled, self.points.points * factor[owner][:, None] + shifts + scaled.rest[owner], shifts
 
     def equations(
-        self, theta: NDArray, state: BodyState, rig: Rig, pixels: PixelFrames, f: int, *, loss: Loss = SQUARED,
-        freedom: NDArray | None = None,
-    ) -> tuple[NDArray, NDArray, float]:  # fmt: skip
-        """Equations of frame f's pixels: H (n + p, n + p; lower triangle), g (n + p,), pose then shape; their cost.
+        self, theta: NDArray, state: BodyState, rig: Rig, place: NDArray, pixels: PixelFrames, f: int, loss: Loss
+    ) -> tuple[NDArray, NDArray, float]:
+        """Equations of frame f's pixels: H (m, m; lower triangle), g (m,), and their cost.
 
-        With `freedom` (C, 10) the cameras' parameters follow, see `solvers.bundle.cameras`.
+        Unknowns are the pose (n,), the shape (p,) and the cameras' free parameters, as `CameraPrior.place` lists them.
         """
         tree, body = self.body.tree, self.body
         moved, rest, _ = self.geometry(theta)
         placed, screws = moved.forward(state.T_world_root, state.angles)
         first = tree.n_dofs + len(self.mean)
-        size = first + (0 if freedom is None else freedom.size)
+        size = first + place.max(initial=-1) + 1
         H, g = np.zeros((size, size)), np.zeros(size)
         cost = _kernels_shape.frame_system(
             tree.parents, tree.dof_parent, tree.last_dof, tree.offsets, body.segment_scale, len(body.scale_groups),
             self.points.segments, rest, self.points.points, self.shift, self.mirror, rig.packed, pixels.camera,
-            pixels.column, pixels.uv[f], pixels.weight[f], pixels.shares, placed, screws,
+            pixels.column, pixels.uv[f], pixels.weight[f], pixels.share, placed, screws,
             np.ascontiguousarray(state.T_world_root[:3, 3]), loss.kind, loss.scale,
-            np.empty((0, 0)) if freedom is None else freedom, -1 if freedom is None else first,
-            np.zeros(pixels.uv[f].shape) if pixels.velocity is None else pixels.velocity[f], H, g,
+            np.where(place < 0, -1, first + place), pixels.velocity[f], H, g,
         )  # fmt: skip
         return H, g, cost
 
