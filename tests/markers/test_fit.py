@@ -39,7 +39,7 @@ def test_a_track_of_the_same_markers_agrees(recording):
     _, markers = recording
     body, names = load_body("humanoid"), tuple(bare(name) for name in markers.names)
     subject = fit_marker_subject(body, markers, "HANIM_45")
-    fitted = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma)
+    fitted = fit_markers(subject, markers)
     steps = [[MarkerFrame("mocap", t, names, x, "HANIM_45")] for t, x in zip(markers.times, markers.positions)]
     tracked = track(Recording.of_frames(steps, Rig(()), rate=markers.rate, up=markers.up), body)
     np.testing.assert_allclose(tracked.body.tree.offsets, fitted.body.tree.offsets, atol=1e-9)

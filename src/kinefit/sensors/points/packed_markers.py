@@ -100,6 +100,13 @@ class PackedMarkers:
         factor = np.array([self.scale[sensor.name] for sensor, _ in self.streams])
         return np.asarray(self.stated / np.square(factor[self.source]))
 
+    @property
+    def measured(self) -> tuple[NDArray, NDArray]:
+        """(T, K, 3) [m] as measured, NaN where unobserved, and (K,) [m] stated standard deviations, for solvers."""
+        x = room(self.places.shape)
+        x[:] = np.where(self.stated[..., None] > 0.0, self.places, np.nan)
+        return x, 1.0 / np.sqrt(self.stated.max(axis=0))
+
     def part(self, frames: slice) -> PackedMarkers:
         """The markers of some frames."""
         return replace(self, places=self.places[frames], stated=self.stated[frames], times=self.times[frames])
