@@ -28,6 +28,7 @@ from benchmarks.peers.environments import run_peer
 from kinefit import Markers, Motion, load_body, read_markers
 from kinefit.cli.markers._fit import worn_body
 from kinefit.exporters import write_markers, write_osim
+from kinefit.markers.poses import columns, sequence_both_ways
 from kinefit.markers.subject import MarkerSubject, fit_marker_subject
 from kinefit.readers.c3d_file import read_c3d
 from kinefit.tracking.markers import fit_markers
@@ -124,7 +125,8 @@ def opensim() -> None:
     print(f"# bmc run: sagittal angles, RMS difference [deg], as they are: {told(plain)}")
     print(f"# bmc run: sagittal angles, RMS difference [deg], each with its own zero: {told(values)}")
     joints = {f"{j}_{s}": f"{n}_{s}" for j, n in OPENSIM.items() for s in "rl"}
-    seconds = fastest(lambda: fit_markers(subject, trials[1]))
+    x = columns(trials[1], subject.points.names)
+    seconds = fastest(lambda: sequence_both_ways(subject.body, subject.points, x, subject.sigma))  # as OpenSim: no bars
     with tempfile.TemporaryDirectory() as name:
         own = Path(name)
         write_osim(worn_body(subject, trials[1].names), own / "body.osim")

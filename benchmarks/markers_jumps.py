@@ -1,4 +1,4 @@
-"""Flat valleys of a frame's cost in `kinefit markers fit`: jumps from frame to frame, and the bars that deny them.
+"""Flat valleys of the cost in `kinefit markers fit`: jumps from frame to frame, and the bars that deny them.
 
 A jump is a step of an angle that departs by more than 10° from the mean of the two steps before and the two after it.
 It is covered where the stated deviations of its two frames allow it within two sigma. Labels that are known to be wrong
