@@ -63,7 +63,7 @@ def squats() -> None:
     roots, angles = sequence_both_ways(subject.body, subject.points, x, subject.sigma)
     gain = second_call(subject.body, subject.points, x, roots, angles, sigma=subject.sigma, **SETTINGS["robust"])
     figure("faults_solver_squats_second_call", int(np.sum(gain > MAX_GAIN)), "frames", "== 0")
-    motion = fit_markers(subject.body, take, subject.marker_set, sigma=subject.sigma)
+    motion = fit_markers(subject, take)
     left = np.nanmean(motion.residuals["markers"].norms, axis=1)
     print(f"# squats: residual {1e3 * left.mean():.2f} mm on average, {1e3 * left.max():.1f} mm in the worst frame")
     figure("faults_solver_squats_over_10mm", int(np.sum(left > MAX_RESIDUAL)), "frames", "== 0")

@@ -28,9 +28,10 @@ from benchmarks.peers.environments import run_peer
 from kinefit import Markers, Motion, load_body, read_markers
 from kinefit.cli.markers._fit import worn_body
 from kinefit.exporters import write_markers, write_osim
-from kinefit.markers.fit import fit_markers
+from kinefit.markers.poses import columns, sequence_both_ways
 from kinefit.markers.subject import MarkerSubject, fit_marker_subject
 from kinefit.readers.c3d_file import read_c3d
+from kinefit.tracking.markers import fit_markers
 
 CHILD = {"hip": "thigh", "knee": "shank", "ankle": "foot", "shoulder": "upperarm", "elbow": "forearm", "wrist": "hand"}
 SAGITTAL = {"hip": "hip_flexion", "knee": "knee_angle", "ankle": "ankle_angle"}
@@ -55,7 +56,7 @@ def run() -> None:
 def fitted(trials: list[Markers]) -> tuple[MarkerSubject, Motion]:
     """Subject from all trials, and the motion of the last."""
     subject = fit_marker_subject(load_body("humanoid"), trials)
-    return subject, fit_markers(subject.body, trials[-1], subject.marker_set, sigma=subject.sigma)
+    return subject, fit_markers(subject, trials[-1])
 
 
 def plug_in_gait() -> None:
@@ -124,7 +125,8 @@ def opensim() -> None:
     print(f"# bmc run: sagittal angles, RMS difference [deg], as they are: {told(plain)}")
     print(f"# bmc run: sagittal angles, RMS difference [deg], each with its own zero: {told(values)}")
     joints = {f"{j}_{s}": f"{n}_{s}" for j, n in OPENSIM.items() for s in "rl"}
-    seconds = fastest(lambda: fit_markers(subject.body, trials[1], subject.marker_set, sigma=subject.sigma))
+    x = columns(trials[1], subject.points.names)
+    seconds = fastest(lambda: sequence_both_ways(subject.body, subject.points, x, subject.sigma))  # as OpenSim: no bars
     with tempfile.TemporaryDirectory() as name:
         own = Path(name)
         write_osim(worn_body(subject, trials[1].names), own / "body.osim")
@@ -174,7 +176,7 @@ def landmarks() -> None:
         kept = [i for i, n in enumerate(static.names) if n not in medial]
         bare = Markers(tuple(static.names[i] for i in kept), static.rate, static.positions[:, kept])
         subject = fit_marker_subject(load_body("humanoid"), [bare, moving])
-        motion = fit_markers(subject.body, bare, subject.marker_set, sigma=subject.sigma)
+        motion = fit_markers(subject, bare)
         reference = {
             key: np.mean([static.positions[:, static.names.index(n)] for n in pair], axis=0)
             for key, pair in ends.items()
@@ -215,7 +217,7 @@ def known_person() -> None:
         still = replace(markers, positions=x[:20])
         for trials in ([still], [still, markers]):
             subject = fit_marker_subject(load_body("humanoid"), trials)
-            motion = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma)
+            motion = fit_markers(subject, markers)
             legs = [truth.body.tree.segment(f"{n}_{s}") for n in ("thigh", "shank", "foot") for s in "rl"]
             errors.append(1e3 * float(joint_errors(truth, motion)[:, legs].mean()))
     told_of, moved = np.array(errors).reshape(-1, 2).T

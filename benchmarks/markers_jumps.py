@@ -1,4 +1,4 @@
-"""Flat valleys of a frame's cost in `kinefit markers fit`: jumps from frame to frame, and the bars that deny them.
+"""Flat valleys of the cost in `kinefit markers fit`: jumps from frame to frame, and the bars that deny them.
 
 A jump is a step of an angle that departs by more than 10° from the mean of the two steps before and the two after it.
 It is covered where the stated deviations of its two frames allow it within two sigma. Labels that are known to be wrong
@@ -26,8 +26,9 @@ from kinefit.solvers.sequence import fit_sequence
 
 DROP_JUMP = "markers/nimblephysics/data__grf__Subject4__MarkerData__DJ1.trc"
 SQUATS = "markers/nimblephysics/data__grf__Subject4__MarkerData__squats1.trc", 680
+NO_SET = "markers/btkdata/Input__C3DSamples__c3d.org__sample01__Eb015pr.c3d"  # no marker set explains its labels
 TAKES = (
-    *CLEAN, FLIP, "markers/nimblephysics/data__c3d__nick_freeform_001.c3d",
+    *(name for name in CLEAN if name != NO_SET), FLIP, "markers/nimblephysics/data__c3d__nick_freeform_001.c3d",
     *(f"forces_nimblephysics/subject4/{name}.trc" for name in ("DJ2", "STSweakLegs1", "walking2", "walkingTO1")),
     *(f"forces_nimblephysics/opencap/{name}.trc" for name in ("DJ1", "walking2")),
 )  # fmt: skip
@@ -82,7 +83,7 @@ def run() -> None:
             continue
         subject = fit_marker_subject(load_body("humanoid"), markers)
         began = time.process_time()
-        motion = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma)
+        motion = fit_markers(subject, markers)
         seconds, frames, takes = seconds + time.process_time() - began, frames + len(motion), takes + 1
         trunk = [motion.body.tree.coordinates.index(angle) for angle in TRUNK]
         jump, uncovered = jumps(motion)

@@ -1,7 +1,6 @@
 """`kinefit markers fit` and `kinefit track` on one file of labelled markers: the same body, poses, quality, lost limbs.
 
-Both through the commands' own functions, with defaults, on whole recordings. `markers fit` judges each frame on its
-own but for flat valleys, `track` smooths them all together, so poses may differ by what smoothing takes away.
+Both through the commands' own functions, with defaults, on whole recordings. They are one road: what differs is a fault.
 """
 
 from __future__ import annotations

@@ -78,7 +78,7 @@ def both(model: MarkerModel, points: Markers) -> float:
     labelled = identify_take(model, points).markers(points)
     named = time.process_time() - start
     subject = fit_marker_subject(load_body("humanoid"), labelled)
-    fit_markers(subject.body, labelled, subject.marker_set, sigma=subject.sigma)
+    fit_markers(subject, labelled)
     return named
 
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, data
 from benchmarks.motions import MOTIONS, library
 from kinefit import Body, Markers, Motion, load_body, read_markers
-from kinefit.markers.fit import fit_markers
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.simulation import cut
 from kinefit.simulation.retarget import known_motion
+from kinefit.tracking.markers import fit_markers
 
 _NIMBLE = "markers/nimblephysics/data__"
 _STANFORD = _NIMBLE + "grf__Subject4__MarkerData__%s1.trc"
@@ -76,7 +76,7 @@ def takes() -> dict[str, Take]:
         trials = [_thinned(read_markers(folder / f)) for f in files]
         subject = fit_marker_subject(load_body("humanoid"), trials)
         for k, trial in enumerate(trials):
-            motion = fit_markers(subject.body, trial, subject.marker_set, sigma=subject.sigma)
+            motion = fit_markers(subject, trial)
             out[f"{person} {k + 1}"] = Take(person, _plain(motion), True)
     return out
 

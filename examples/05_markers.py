@@ -47,7 +47,7 @@ def main(labelled=None, points=None, out="kinefit-example"):
 
     # Size of the body and place of each marker from all frames together, then the angles of every frame.
     subject = kinefit.fit_marker_subject(kinefit.load_body("humanoid"), named)
-    motion = kinefit.fit_markers(subject.body, named, subject.marker_set, sigma=subject.sigma)
+    motion = kinefit.fit_markers(subject, named)
     off = motion.residuals["markers"].norms
     print(f"body {subject.body.stature:.2f} m tall, markers {1e3 * np.nanmedian(off):.1f} mm off in the median")
     for name in ("hip_flexion_r", "knee_angle_r", "elbow_flex_r"):

@@ -47,9 +47,9 @@ from kinefit.identification.model.gate import training_gate as training_gate
 from kinefit.identification.model.learn import learn_model as learn_model
 from kinefit.identification.take.takes import identify_people as identify_people
 from kinefit.identification.take.takes import identify_take as identify_take
-from kinefit.markers.fit import fit_markers as fit_markers
 from kinefit.markers.poses import split_people as split_people
 from kinefit.markers.subject import fit_marker_subject as fit_marker_subject
+from kinefit.tracking.markers import fit_markers as fit_markers
 
 # Calibration, and checks of a recording
 from kinefit.calibration.board.calibrate import calibrate_board as calibrate_board

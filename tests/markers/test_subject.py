@@ -9,11 +9,11 @@ from kinefit import Markers, load_body
 from kinefit.bodies.marker_sets import placement
 from kinefit.errors import KinefitError, ObservationError, TrackingError
 from kinefit.evaluation import joint_errors
-from kinefit.markers.fit import fit_markers
 from kinefit.markers.poses import columns, split_people
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.readers.markers import read_markers
 from kinefit.simulation import squat_and_wave
+from kinefit.tracking.markers import fit_markers
 
 BODY = load_body("humanoid")
 REAL = {  # file of the folder markers: set that is found, markers of it, stature [m] that a person has
@@ -47,7 +47,7 @@ def test_size_and_offsets_of_a_known_person(known):
     lengths, found = truth.body.segment_lengths(), subject.body.segment_lengths()
     for bone in ("thigh_r-shank_r", "shank_l-foot_l", "upperarm_r-forearm_r"):
         assert found[bone] == pytest.approx(lengths[bone], abs=0.015)
-    motion = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma)
+    motion = fit_markers(subject, markers)
     assert np.sqrt(np.nanmean(motion.residuals["markers"].norms ** 2)) < 0.005
     errors = joint_errors(truth, motion)
     assert errors.mean() < 0.02  # [m] markers are held to slide by 5 mm or more, which these do not
@@ -69,9 +69,9 @@ def test_hidden_limbs_and_frames_are_bridged(known):
     x[60:70] = np.nan
     hidden = Markers(markers.names, markers.rate, x, up=markers.up)
     subject = fit_marker_subject(BODY, hidden)
-    motion = fit_markers(subject.body, hidden, subject.marker_set, sigma=subject.sigma)
+    motion = fit_markers(subject, hidden)
     assert np.isfinite(motion.angles).all()
-    whole = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma)
+    whole = fit_markers(subject, markers)
     steps = np.linalg.norm(np.diff(motion.positions(), axis=0), axis=2).max()
     assert steps < 2 * np.linalg.norm(np.diff(whole.positions(), axis=0), axis=2).max()
     assert motion.quality[60:70].max() == 0.0
@@ -87,8 +87,8 @@ def test_a_wrong_label_does_not_pull(known):
     x[10:20, [a, b]] = x[10:20, [b, a]]
     swapped = Markers(markers.names, markers.rate, x, up=markers.up)
     subject = fit_marker_subject(BODY, swapped)
-    motion = fit_markers(subject.body, swapped, subject.marker_set, sigma=subject.sigma)
-    whole = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma)
+    motion = fit_markers(subject, swapped)
+    whole = fit_markers(subject, markers)
     weights = motion.residuals["markers"].weights[10:20, motion.residuals["markers"].names.index("RKNE")]
     assert weights.max() < 0.1
     knee = motion.body.tree.segment("shank_r")
@@ -126,7 +126,7 @@ def test_real_takes(data_dir, name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         subject = fit_marker_subject(BODY, markers, frames=30)
-        motion = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma)
+        motion = fit_markers(subject, markers)
     assert (subject.marker_set, len(subject.points)) == REAL[name]
     assert 1.5 < subject.body.stature < 2.0
     residuals = motion.residuals["markers"]

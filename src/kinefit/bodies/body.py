@@ -199,6 +199,11 @@ class Body:
         Ts = self.tree.segment_poses(Ts_world_root, angles)
         return se3.apply(Ts[:, points.segments], points.points)
 
+    def without_limits(self) -> Body:
+        """The body with joints that move without limits."""
+        limit = np.full(len(self.tree.coordinates), np.inf)
+        return replace(self, tree=replace(self.tree, lower=-limit, upper=limit))
+
     def scaled(self, scales: NDArray) -> Body:
         """Scale the body: one factor (G,) for every scale group; gear keeps its size. Joints and points move along.
 

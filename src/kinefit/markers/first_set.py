@@ -15,7 +15,7 @@ from kinefit.bodies.marker_sets.placement import placed
 from kinefit.bodies.marker_sets.sets import LANDMARK_SPREAD, MarkerRecord, SetRecord, bare, catalogue, plain, side_pairs
 from kinefit.errors import KinefitError
 from kinefit.identification.model.learn import learn_model, usable_markers
-from kinefit.markers.fit import fit_markers
+from kinefit.markers.poses import columns, sequence_both_ways
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.observations import Markers
 
@@ -147,10 +147,10 @@ def _fit_segments(
     bare_markers = replace(markers, names=tuple(bare(n) for n in markers.names))
     try:
         subject = fit_marker_subject(replace(body, marker_sets={"words": points}), bare_markers, "words")
-        motion = fit_markers(subject.body, bare_markers, "words", sigma=subject.sigma)
+        x = columns(bare_markers, subject.points.names)
+        poses = subject.body.tree.segment_poses(*sequence_both_ways(subject.body, subject.points, x, subject.sigma))
     except KinefitError:
         return None
-    poses = motion.segment_poses()
     scale = subject.scales[body.segment_scale]
     tree = body.tree
     catalogue_names = {image for r in catalogue().values() for s in r.segment for image in (s.name, f"{s.name[:-2]}_l")}

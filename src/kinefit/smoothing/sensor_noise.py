@@ -260,6 +260,8 @@ def marker_noise(
         found[sensor], shared[q][:, own] = noise, noise.shared[0][:, None]
         variance[own] = _systematic(noise, leverage, np.repeat(stated[:, None], 3, axis=1), MarkerMatched.independent)
     systematic, upper = room(information.shape), np.triu_indices(body.tree.n_dofs)
+    posture = np.zeros((body.tree.n_dofs, body.tree.n_dofs))  # away from its mean a posture lasts: frames repeat the
+    posture[6:, 6:] = body.tree.posture_precision  # same error of the prior, which counts where the cost is flat
     for some in stretches(T, MATRIX_FRAMES):
         frames = np.arange(some.start, some.stop)
         first, stop = np.maximum(frames - half, 0), np.minimum(frames + half + 1, T)
@@ -272,7 +274,7 @@ def marker_noise(
         mean = (total[stop - first[0]] - total[first - first[0]]) / (stop - first)[:, None, None, None]
         own, common = np.sqrt(variance)[..., None] * mean, np.einsum("qak,fkan->fqan", shared, mean)
         both = np.concatenate([each.reshape(len(frames), -1, body.tree.n_dofs) for each in (own, common)], axis=1)
-        systematic[some] = (both.transpose(0, 2, 1) @ both)[:, upper[0], upper[1]]
+        systematic[some] = (both.transpose(0, 2, 1) @ both + posture)[:, upper[0], upper[1]]
     return OtherNoise(information, systematic, found)
 
 

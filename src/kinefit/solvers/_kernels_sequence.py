@@ -9,8 +9,8 @@ import numpy as np
 from kinefit._jit import jit
 from kinefit.bodies._kernels import forward, retract
 from kinefit.correspondences._kernels import plane_rows, point_rows
-from kinefit.solvers._kernels import assemble, joint_moves
-from kinefit.solvers._kernels_linear import LEAST_DAMPING, adapt, damped_step, invert
+from kinefit.solvers._kernels import assemble
+from kinefit.solvers._kernels_linear import LEAST_DAMPING, adapt, damped_step
 
 _MAX_TRIES = 60  # of more damping, for a matrix that is not positive definite
 
@@ -62,15 +62,13 @@ def fit_sequence(
     parents, dof_start, chain, depth, prismatic, axes, rest_joints, lower, upper, locked,
     owner, rest, target, weight, plane_owner, plane_rest, plane_order, plane_x, plane_n, plane_w,
     usual, posture, prior_pairs, prior, wide, wide_depth, place, kind, scale, max_iterations, tolerance, damping_share,
-    each, roots, angles, costs, iterations,
+    roots, angles, costs, iterations,
 ):  # fmt: skip
     """Fit all frames, each from the last one's solution; roots[0], angles[0] contain the start and are overwritten.
 
-    With `each`, all roots and angles contain starts, and every frame starts from its own.
-
     owner (K,), rest (K, 3), target (F, K, 3) [m], weight (F, K) [1/m²]; planes sorted by segment: plane_owner (P,),
     plane_rest (3, P); not sorted, NaN for missing ones: plane_x, plane_n (F, P, 3); plane_order (P,) sorts them.
-    usual (F, D) is the mean of the posture prior with the share `posture`, see `add_posture`; with it the pattern of H
+    usual (D,) is the mean of the posture prior with the share `posture`, see `add_posture`; with it the pattern of H
     is wide, wide_depth, see `widen`.
     roots (F, 4, 4), angles (F, D), costs (F,), iterations (F,) are filled. Damping starts at `damping_share` of the
     mean diagonal of H in the first frame, and continues from frame to frame. A frame ends when the predicted fall of
@@ -91,8 +89,6 @@ def fit_sequence(
     damping, growth = -1.0, 2.0
     for f in range(roots.shape[0]):
         delta[:] = 0.0
-        if each:
-            root, q, damping = roots[f].copy(), angles[f].copy(), -1.0
         retract(root, q, delta, lower, upper, root, q)
         cost, predicted, count, least = 0.0, 0.0, 0, 0.0
         used = 0
@@ -112,7 +108,7 @@ def fit_sequence(
             )  # fmt: skip
             widen(C, depth, place, wide_depth, other_H)
             if posture > 0.0:
-                new_cost += add_posture(posture, prior_pairs, prior, usual[f], trial_q, other_H, other_g)
+                new_cost += add_posture(posture, prior_pairs, prior, usual, trial_q, other_H, other_g)
             if first:
                 cost = new_cost
                 H, other_H, g, other_g = other_H, H, other_g, g
@@ -151,56 +147,3 @@ def fit_sequence(
         for i in range(n_angles):
             angles[f, i] = q[i]
         costs[f], iterations[f] = cost, used
-
-
-@jit
-def certainties(
-    parents, dof_start, dof_parent, last_dof, chain, depth, prismatic, axes, rest_joints,
-    owner, rest, target, weight, usual, posture, prior_pairs, prior, wide, wide_depth, place, kind, scale,
-    roots, angles, dof_std, joint_std, factors,
-):  # fmt: skip
-    """Standard deviations of fitted frames: dof_std (F, n), joint_std (F, S, 3); robust factors (F, K), 0 if missing.
-
-    Points, prior and patterns as in `fit_sequence`. A frame with a singular matrix has infinite standard deviations.
-    """
-    n_segments, n_angles, points = parents.size, axes.shape[0], owner.size
-    n = n_angles + 6
-    data, segment, group = np.empty((8, 3 * points)), np.empty(3 * points, np.int64), np.empty(3 * points, np.int64)
-    factor, blocks = np.empty(3 * points), np.empty((n_segments, 27))
-    frames, screws = np.empty((n_segments, 12)), np.empty((n_angles, 6))
-    C, H, g, P = np.empty(chain.shape), np.empty(wide.shape), np.empty(n), np.empty((n, n))
-    moves, column = np.empty((n_segments, 3, n)), np.empty(n)
-    for f in range(roots.shape[0]):
-        forward(parents, dof_start, prismatic, axes, rest_joints, roots[f], angles[f], frames, screws)
-        count = point_rows(frames, owner, rest, target[f], weight[f], data, segment, group, 0)
-        assemble(
-            data, segment, group, count, kind, scale, roots[f, :3, 3], parents, dof_start, chain, depth, screws,
-            factor, blocks, C, g,
-        )  # fmt: skip
-        for k in range(points):
-            factors[f, k] = 0.0
-        for i in range(count):
-            factors[f, group[i]] = factor[i]
-        widen(C, depth, place, wide_depth, H)
-        if posture > 0.0:
-            add_posture(posture, prior_pairs, prior, usual, angles[f], H, g)
-        if not invert(H, wide, wide_depth, P):
-            dof_std[f] = np.inf
-            joint_std[f] = np.inf
-            continue
-        for i in range(n):
-            dof_std[f, i] = math.sqrt(P[i, i])
-        joint_moves(frames, screws, rest_joints, roots[f], dof_parent, last_dof, moves)
-        for s in range(n_segments):
-            for axis in range(3):
-                m, total = moves[s, axis], 0.0
-                d = last_dof[s]
-                while d >= 0:
-                    column[d] = 0.0
-                    e = last_dof[s]
-                    while e >= 0:
-                        column[d] += P[d, e] * m[e]
-                        e = dof_parent[e]
-                    total += m[d] * column[d]
-                    d = dof_parent[d]
-                joint_std[f, s, axis] = math.sqrt(total if total > 0.0 else 0.0)

@@ -11,7 +11,6 @@ from kinefit._arguments import check_shape
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
-from kinefit.solvers._kernels_sequence import certainties as _certainties
 from kinefit.solvers._kernels_sequence import fit_sequence as _fit_sequence
 from kinefit.solvers.equations import lock
 from kinefit.solvers.least_squares import bounds_of
@@ -49,7 +48,7 @@ class SequenceFit:
 
 def fit_sequence(
     body: Body,
-    start: BodyState | tuple[NDArray, NDArray],
+    start: BodyState,
     points: PointSet = _NO_POINTS,
     x_world: ArrayLike | None = None,
     *,
@@ -59,7 +58,6 @@ def fit_sequence(
     limits: bool = True,
     locked: NDArray | None = None,
     posture: float = 0.0,
-    usual: NDArray | None = None,
     damping: float = 1e-3,
     max_iterations: int = 200,
     tolerance: float = 1e-6,
@@ -70,7 +68,7 @@ def fit_sequence(
 
     Parameters
     ----------
-    start : BodyState of the first frame, or roots (F, 4, 4) and angles (F, D) from which each frame starts
+    start : BodyState of the first frame
     points : PointSet of K points on the body
     x_world : (F, K, 3) [m]
         Measured points; NaN for missing ones.
@@ -83,8 +81,6 @@ def fit_sequence(
         Degrees of freedom that do not move.
     posture : float
         Share of the body's posture prior, couplings included. It determines what the measurements do not.
-    usual : (F, D) or (D,) [rad or m]
-        Mean of the posture prior; default: the body's.
     damping : float
         First λ as a share of H's mean diagonal.
     tolerance : float
@@ -110,10 +106,8 @@ def fit_sequence(
     p_order = np.argsort(p.points.segments, kind="stable")
     lower, upper = bounds_of(body, limits)
     roots, angles = np.empty((count, 4, 4)), np.empty((count, len(tree.coordinates)))
-    each = not isinstance(start, BodyState)
     if count:
-        first = slice(None) if each else 0
-        roots[first], angles[first] = start if isinstance(start, tuple) else (start.T_world_root, start.angles)
+        roots[0], angles[0] = start.T_world_root, start.angles
     costs, iterations = np.empty(count), np.empty(count, np.int64)
     _fit_sequence(
         tree.parents, tree.dof_start, tree.chain, tree.depth, tree.prismatic, tree.axes, tree.rest, lower, upper,
@@ -122,61 +116,7 @@ def fit_sequence(
         p.points.segments[p_order],
         np.ascontiguousarray(body.points_rest(p.points)[p_order].T),
         p_order, np.ascontiguousarray(p.x_world), np.ascontiguousarray(p.normal), 1.0 / p.sigma**2,
-        np.ascontiguousarray(np.broadcast_to(tree.usual if usual is None else usual, angles.shape), float),
-        posture, *tree.posture_entries, *tree.coupled_pattern, loss.kind, loss.scale, max_iterations, tolerance,
-        damping, each, roots, angles, costs, iterations,
+        tree.usual, posture, *tree.posture_entries, *tree.coupled_pattern, loss.kind, loss.scale, max_iterations,
+        tolerance, damping, roots, angles, costs, iterations,
     )  # fmt: skip
     return SequenceFit(roots, angles, costs, iterations)
-
-
-@dataclass(frozen=True, eq=False)
-class Certainty:
-    """Standard deviations of fitted frames.
-
-    Parameters
-    ----------
-    dof_std : (F, n) [m, rad] of every degree of freedom
-    joint_std : (F, S, 3) [m] of every joint centre along the world's axes
-    factors : (F, K) the points' robust factors in 0..1, 0 where missing
-    """
-
-    dof_std: NDArray
-    joint_std: NDArray
-    factors: NDArray
-
-
-def certainty(
-    body: Body,
-    Ts_world_root: NDArray,
-    angles: NDArray,
-    points: PointSet,
-    x_world: ArrayLike,
-    *,
-    sigma: ArrayLike = 0.005,
-    loss: Loss = SQUARED,
-    posture: float = 0.0,
-) -> Certainty:
-    """Standard deviations of frames that `fit_sequence` fitted to points, from each frame's own covariance.
-
-    They are infinite in a frame whose measurements do not determine all degrees of freedom. With a share `posture` of
-    the prior all angles are determined, and the prior's standard deviation bounds theirs.
-
-    Parameters
-    ----------
-    Ts_world_root, angles : (F, 4, 4), (F, D) of the fit
-    x_world : (F, K, 3) [m] measured points; NaN for missing ones
-    sigma : scalar or (K,) [m]
-    posture : share of the body's posture prior
-    """
-    tree, x = body.tree, np.array(x_world, float, order="C")
-    measured = np.isfinite(x).all(axis=2)
-    weight = np.where(measured, 1.0 / np.square(np.broadcast_to(np.asarray(sigma, float), measured.shape[1:])), 0.0)
-    F, S, n = len(x), len(tree.segments), tree.n_dofs
-    dof_std, joint_std, factors = np.empty((F, n)), np.empty((F, S, 3)), np.empty(measured.shape)
-    _certainties(
-        tree.parents, tree.dof_start, tree.dof_parent, tree.last_dof, tree.chain, tree.depth, tree.prismatic, tree.axes,
-        tree.rest, points.segments, body.points_rest(points), np.nan_to_num(x), weight, tree.usual, posture,
-        *tree.posture_entries, *tree.coupled_pattern, loss.kind, loss.scale, np.ascontiguousarray(Ts_world_root, float),
-        np.ascontiguousarray(angles, float), dof_std, joint_std, factors,
-    )  # fmt: skip
-    return Certainty(dof_std, joint_std, factors)

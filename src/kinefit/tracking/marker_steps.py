@@ -12,28 +12,38 @@ from numpy.typing import NDArray
 from kinefit._mapped import release, room
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import TrackingError
-from kinefit.frame.results import FrameResult
-from kinefit.markers.fit import MarkerTake, refit_outliers
+from kinefit.findings import runs_of
+from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult, frame_results
+from kinefit.markers.poses import sequence_both_ways
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.spool import stretches
+from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.smoothing.unwrap import unwrap
+from kinefit.solvers.equations import inverse
+from kinefit.solvers.sequence import fit_sequence
+from kinefit.solvers.trajectory.seen_points import SeenPoints
+from kinefit.solvers.trajectory.smoothing import unpacked
 from kinefit.subject.subject import Progress
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import TrackedSteps, tracker_of
 
 _SEQUENCE_FRAMES = 6000  # that are fitted in one call
+_OUTLIER_MISFIT_RATIO = 4.0  # times the take's median misfit: such frames are fitted again without initial pose
+_MAX_REFIT_RUNS = 50  # runs of such frames
 
 
 def fit_marker_steps(
-    recording: Recording, body: Body, settings: TrackSettings, *, progress: Progress | None = None
+    recording: Recording, body: Body, settings: TrackSettings, *, judge: bool = False, progress: Progress | None = None
 ) -> TrackedSteps | None:
     """Fit all steps of a recording of labelled markers alone, each from its neighbour's pose.
 
     None if the steps need the tracker: other sensors take part, a first pose is given, the body has closures or joints
-    that move with its shape, markers were measured between the steps, or too few are visible to start. Standard
-    deviations and quality are left to the smoother.
+    that move with its shape, markers were measured between the steps, or too few are visible to start.
+
+    Parameters
+    ----------
+    judge : whether frames get standard deviations and quality of their own, which otherwise the smoother gives
     """
     if not recording.markers_alone or recording.start is not None or recording.others or body.closures:
         return None
@@ -50,26 +60,79 @@ def fit_marker_steps(
         markers = PackedMarkers.of(body, _OnDemand(len(times), measured), times, settings.marker_loss)
     if markers is None or sensors - set(markers.sensors):
         return None
-    data = MarkerTake.of(body, markers)
     roots, angles = room((len(times), 4, 4)), room((len(times), len(body.tree.coordinates)))
     last: BodyState | None = None
     for some in stretches(len(times), _SEQUENCE_FRAMES):
-        part = data.part(some)
+        part = markers.part(some)
         try:
-            found = part.poses(slice(None)) if last is None else part.poses_after(last)
+            roots[some], angles[some] = _refit_outliers(body, part, *_poses_after(last, body, part))
         except TrackingError:
             return None
-        roots[some], angles[some] = refit_outliers(part, *found)
         last = BodyState(roots[some][-1], angles[some][-1])
-        release(data.x, roots, angles)
+        release(markers.places, markers.stated, roots, angles)
         if progress:
             progress("frames", some.stop, len(times))
     angles[:] = unwrap(body.tree, angles)
     nothing = _OnDemand(len(times), lambda f: ())
+    results = _judged(body, markers, roots, angles) if judge else _poses(body, times, roots, angles)
     return TrackedSteps(
-        _poses(body, times, roots, angles), nothing, nothing, times, recording.rate, tracker.scene_of, tracker.apart,
-        list(range(len(times))), tracker, True, markers=markers,
+        results, nothing, nothing, times, recording.rate, tracker.scene_of, tracker.apart, list(range(len(times))),
+        tracker, True, markers=markers,
     )  # fmt: skip
+
+
+def _poses_after(last: BodyState | None, body: Body, markers: PackedMarkers) -> tuple[NDArray, NDArray]:
+    """Roots (F, 4, 4) and angles (F, D) [rad], fitted from the state before the first frame; None: without one."""
+    x, sigma = markers.measured
+    if last is None:
+        return sequence_both_ways(body, markers.points, x, sigma, loss=markers.loss)
+    fit = fit_sequence(body, last, markers.points, x, sigma=sigma, loss=markers.loss, posture=1.0)
+    return fit.Ts_world_root, fit.angles
+
+
+def _misfit(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> NDArray:
+    """(F,) mean misfit of the markers in each frame, in standard deviations, each clipped at ten."""
+    off = np.sqrt(markers.squares(markers.gaps(body, roots, angles)))
+    seen = np.isfinite(off)
+    return np.where(seen, np.minimum(np.nan_to_num(off), 10.0), 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+
+
+def _refit_outliers(
+    body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Fit frames with an outlying misfit again without initial pose; keep the better fit."""
+    roots, angles = roots.copy(), angles.copy()
+    misfit = _misfit(body, markers, roots, angles)
+    is_outlier = misfit > max(_OUTLIER_MISFIT_RATIO * float(np.median(misfit)), 3.0)
+    for a, b in sorted(runs_of(is_outlier), key=lambda run: run[0] - run[1])[:_MAX_REFIT_RUNS]:
+        part = markers.part(slice(a, b))
+        try:
+            other_roots, other_angles = _poses_after(None, body, part)
+        except TrackingError:
+            continue
+        better = _misfit(body, part, other_roots, other_angles) < 0.9 * misfit[a:b]
+        roots[a:b][better], angles[a:b][better] = other_roots[better], other_angles[better]
+    return roots, angles
+
+
+def _judged(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> Spool[FrameResult]:
+    """Fitted poses (F, 4, 4), (F, D) as frames with the standard deviations of each frame on its own."""
+    tree, out = body.tree, Spool[FrameResult]()
+    prior = np.zeros((tree.n_dofs, tree.n_dofs))
+    prior[6:, 6:] = tree.posture_precision
+    prior[:6, :6] = np.eye(6)
+    for some in stretches(len(roots), MATRIX_FRAMES):
+        part, at = markers.part(some), (roots[some], angles[some])
+        points = SeenPoints.in_metres(part.points, part.places, part.weight, part.loss)
+        information = unpacked(points.equations(body)(*at)[0], tree) + prior
+        covariances = np.stack([inverse(H) for H in information])
+        observed = np.sqrt(np.einsum("fii->fi", covariances))[:, 6:] <= UNOBSERVED_STD_RATIO * tree.spread
+        for result in frame_results(
+            body, *at, part.times, covariances, part.evidence(body, part.gaps(body, *at)), observed=observed,
+            iterations=np.zeros(len(covariances), int).tolist(),
+        ):
+            out.append(result)
+    return out
 
 
 class _OnDemand(Sequence[Any]):

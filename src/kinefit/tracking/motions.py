@@ -149,7 +149,8 @@ def motion_of(
     if channels.view_bias is not None and subject.view_bias is not None:
         provenance["view bias"] = subject.view_bias.as_record()
     provenance["length_std_m"] = subject.length_std
-    provenance["estimate"] = "smoothed" if smooth else "filtered" if lag is None else "fixed lag"
+    alone = "filtered" if frames.markers is None else "each frame alone"
+    provenance["estimate"] = "smoothed" if smooth else alone if lag is None else "fixed lag"
     return Motion(
         body=body, rate=rate, times=frames.times, **_arrays(last, body, len(results)), residuals=residuals, up=up,
         name=name, provenance=provenance, lasting=lasting,

@@ -18,7 +18,7 @@ from kinefit.frame.results import FrameResult
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.initialization.from_depth import Start, StartSearch, sized_start, start_from_points
-from kinefit.markers.subject import fit_marker_subject
+from kinefit.markers.subject import MarkerSubject, fit_marker_subject
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import Channels, known_names, make_channels
 from kinefit.sensors.points.keypoints import keypoint_sigma
@@ -75,12 +75,19 @@ class SizedPerson:
     values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
-    def reporting(self, **entries: Any) -> SizedPerson:
-        """The same with more entries of `provenance`."""
-        return replace(self, provenance={**self.provenance, **entries})
     poses: Mapping[int, BodyState] = field(default_factory=dict)
     joint: tuple[SubjectFit, ...] = ()
     calibrated: Rig = field(default_factory=lambda: Rig(()))
+
+    def reporting(self, **entries: Any) -> SizedPerson:
+        """The same with more entries of `provenance`."""
+        return replace(self, provenance={**self.provenance, **entries})
+
+    def with_markers(self, found: MarkerSubject, body: Body) -> SizedPerson:
+        """The same with the subject that labelled markers gave, on a body of its size."""
+        subject = Subject(body, found.scales, length_share=found.scale_std / found.scales)
+        person = replace(self, subject=subject, joint=(*self.joint, found.fit))
+        return person.reporting(markers={"rms_m": round(found.rms, 4), "frames": found.frames})
 
 
 def channels_of(recording: Recording, body: Body, settings: TrackSettings) -> Channels:
@@ -139,9 +146,10 @@ def fitted_to_person(
         person = replace(person, subject=by_keypoints).reporting(**_gear_of(body, by_keypoints))
         person = _with_depth_cameras(person, settings)
     elif recording.markers and recording.markers[0].marker_set:
-        person, found = _by_markers(person, height, progress)
+        person = _by_markers(person, height, progress)
         if recording.markers_alone and not unknown:
-            return replace(person, joint=(found,))
+            return person
+        person = replace(person, joint=())
     else:
         if height:
             scales = np.full(len(body.scale_groups), height / body.stature)
@@ -183,17 +191,15 @@ def _gear_of(body: Body, found: Subject) -> dict[str, Any]:
     return {"shape": {n: [round(found.fit.value(n)[0], 4), round(float(std[n]), 4)] for n in names}}
 
 
-def _by_markers(person: SizedPerson, height: float | None, progress: Progress | None) -> tuple[SizedPerson, SubjectFit]:
+def _by_markers(person: SizedPerson, height: float | None, progress: Progress | None) -> SizedPerson:
     """Lengths, the markers' own places and how far each moves on its segment, from one marker system alone."""
     r, body, worn = person.recording, person.subject.body, person.recording.markers[0]
     name, points = worn.marker_set, body.markers(worn.marker_set)
     placed = name if worn.std is None else MarkerPlacement(name, points, worn.std)
     found = fit_marker_subject(body, worn.markers, placed, height=height, progress=progress)
-    subject = Subject(found.body, found.scales, length_share=found.scale_std / found.scales)
     each = {f"{worn.sensor} {name}": float(s) for name, s in zip(found.points.names, found.sigma)}
     person = replace(person, recording=replace(r, sigma={**r.sigma, **each}))
-    markers = {"rms_m": round(found.rms, 4), "frames": found.frames}
-    return replace(person, subject=subject).reporting(markers=markers), found.fit
+    return person.with_markers(found, found.body)
 
 
 def sized_by_depth(person: SizedPerson, progress: Progress | None = None) -> SizedPerson:

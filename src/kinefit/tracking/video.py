@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from kinefit._arguments import checked
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
@@ -16,7 +18,7 @@ from kinefit.tracking.marker_steps import fit_marker_steps
 from kinefit.tracking.motions import Estimation, motion_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import run
-from kinefit.tracking.sizing import fitted_to_person
+from kinefit.tracking.sizing import SizedPerson, fitted_to_person
 
 
 @checked
@@ -92,11 +94,33 @@ def track(
     person = fitted_to_person(
         recording, body, settings, subject=known, trial=trial, height=height, frames=shape_frames, progress=progress
     )
-    fitted = None
-    if smooth and lag is None and person.start is None and not person.poses:  # else a frame must know of no later one
-        fitted = fit_marker_steps(person.recording, person.subject.body, settings, progress=progress)
+    how = Estimation(smooth and lag is None, contacts, None, recording.level, lag, noise)
+    return motion_of_person(person, settings, how, progress=progress, checkpoint=checkpoint)
+
+
+def motion_of_person(
+    person: SizedPerson, settings: TrackSettings, how: Estimation, *, each: bool = False,
+    progress: Progress | None = None, checkpoint: Checkpoint | None = None,
+) -> Motion:  # fmt: skip
+    """Motion of a sized person: all steps are tracked, then smoothed if `how` says so.
+
+    Parameters
+    ----------
+    each : bool
+        Labelled markers alone, not smoothed: fit each frame on its own, from its neighbour's pose in either direction
+        of time. Otherwise a frame that is not smoothed knows of no later one.
+    progress, checkpoint : as of `track`
+
+    Raises
+    ------
+    TrackingError, TrackingInterrupted
+        As `track`.
+    """
+    recording, fitted = person.recording, None
+    if (how.smooth or each) and how.lag is None and person.start is None and not person.poses:
+        fitted = fit_marker_steps(recording, person.subject.body, settings, judge=not how.smooth, progress=progress)
     tracked = fitted or run(
-        person.recording, person.subject.body, settings, start=person.start, values=person.values,
+        recording, person.subject.body, settings, start=person.start, values=person.values,
         view_bias=person.subject.view_bias, poses=person.poses, progress=progress, checkpoint=checkpoint,
     )  # fmt: skip
     tracker = tracked.tracker
@@ -104,15 +128,12 @@ def track(
     more = {**person.provenance, **others, "frames": {"dropped": tracker.dropped, "late": tracker.late}}
     if (family := person.subject.body.family) is not None:
         more["body shape"] = {name: round(value, 3) for name, value in family.shape.items()}
-    how = Estimation(
-        smooth and lag is None and tracked.complete, contacts,
-        None if recording.alone is None else recording.alone.centre_world, recording.level,
-        lag if tracked.complete else None, noise,
-    )  # fmt: skip
+    eye = None if recording.alone is None else recording.alone.centre_world
+    lag = how.lag if tracked.complete else None
+    how = replace(how, smooth=how.smooth and tracked.complete, eye=eye, lag=lag)
     motion = motion_of(
         tracked, person.subject, settings, how, up=recording.up, name=recording.name, more=more, found=person.joint
     )
     if not tracked.complete:
         raise TrackingInterrupted(motion, len(recording))
     return motion
-

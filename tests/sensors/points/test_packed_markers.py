@@ -41,6 +41,14 @@ def test_every_frame_has_its_markers_again():
     assert part.measurements(0)[0].names == ("neck", "r_hip")
 
 
+def test_solvers_get_places_and_sigma_of_what_was_measured():
+    packed = PackedMarkers.of(BODY, measurements(), times(), LOSS)
+    x, sigma = packed.measured
+    np.testing.assert_array_equal(np.isfinite(x).all(axis=2), packed.stated > 0.0)
+    np.testing.assert_allclose(sigma, [0.005, 0.005, 0.02, 0.005])
+    np.testing.assert_array_equal(packed.part(slice(2, 3)).measured[1], 1.0)  # nothing seen: any finite one
+
+
 def test_residuals_factors_and_evidence_are_those_of_each_match():
     packed = PackedMarkers.of(BODY, measurements(), times(), LOSS)
     roots, angles = MOTION.Ts_world_root[:4], MOTION.angles[:4] + 0.05

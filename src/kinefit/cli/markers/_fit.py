@@ -221,6 +221,7 @@ class MarkerFitOptions:
     up : str, optional, vertical axis of the world where the file does not state it; default: found from the markers.
     limits : bool, whether joints stay within their ranges.
     sides : str, optional, one of `bodies.marker_sets.SIDES`: how sides are read; default: as labelled, checked.
+    smooth : bool, whether all frames are fitted together, see `fit_markers`.
     """
 
     body: str | Path = "humanoid"
@@ -230,6 +231,7 @@ class MarkerFitOptions:
     up: str | None = None
     limits: bool = True
     sides: str | None = None
+    smooth: bool = True
 
 
 def fit_file(
@@ -259,9 +261,9 @@ def fit_file(
     """
     from kinefit.diagnostics.quick import motion_findings
     from kinefit.exporters import write_markers, write_osim, write_trc
-    from kinefit.markers.fit import fit_markers
     from kinefit.markers.sides import label_findings, refuse_wrong_sides
     from kinefit.markers.subject import fit_marker_subject
+    from kinefit.tracking.markers import fit_markers
 
     step, formats, options = step or (lambda what, done, total: None), tuple(formats), options or MarkerFitOptions()
     folder = out if out is not None else path.with_name(f"{path.stem}-kinefit")
@@ -286,7 +288,7 @@ def fit_file(
             progress=step,
         )  # fmt: skip
         motion = fit_markers(
-            subject.body, markers, subject.marker_set, sigma=subject.sigma, limits=options.limits, up=options.up
+            subject, markers, limits=options.limits, up=options.up, smooth=options.smooth, progress=step
         )
         findings = [*faults_of(found_labels), *motion_findings(motion, options.height)]
         motion = replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings)})

@@ -181,14 +181,16 @@ Examples:
               help="How left and right are read: exchanged labels, a world with one axis negated, or as labelled "
               "without a check.  [default: as labelled, checked]")
 @click.option("--limits/--no-limits", default=True, show_default=True, help="Keep joint angles within their limits.")
+@click.option("--smooth/--no-smooth", default=True, show_default=True, help="Fit all frames together, or each alone.")
 @click.option("--formats", metavar="LIST", help="Formats to write.  [default: motion,mot,osim,trc,bvh,glb,markers]")
 @_unit
 @_screen.verbose_option
 def fit(
     take: Path, out: Path | None, subjects: tuple[Path, ...], static: Path | None, body: str, marker_set: str | None,
-    height: float | None, up: str | None, sides: str | None, limits: bool, formats: str | None, unit: str | None,
+    height: float | None, up: str | None, sides: str | None, limits: bool, smooth: bool, formats: str | None,
+    unit: str | None,
 ) -> None:  # fmt: skip
-    """Fit a body to markers: size and marker offsets from all frames, then joint angles of each frame."""
+    """Fit a body to markers: size and marker offsets from all frames, then joint angles."""
     from kinefit.cli._summary import print_summary
     from kinefit.cli.markers._fit import FORMATS, MarkerFitOptions, fit_file, identify_file
 
@@ -202,7 +204,7 @@ def fit(
             labelled, named, files = identify_file(take, list(subjects), target, unit=unit, step=step)
             source, unit = files["markers"], None
         known = Path(body) if Path(body).suffix else body
-        options = MarkerFitOptions(known, static, marker_set, height, up, limits, sides)
+        options = MarkerFitOptions(known, static, marker_set, height, up, limits, sides, smooth)
         notes: list[Finding] = []
         found = fit_file(source, out, options, unit=unit, formats=chosen, step=step, notes=notes)
     if subjects:

@@ -100,6 +100,13 @@ class PackedMarkers:
         factor = np.array([self.scale[sensor.name] for sensor, _ in self.streams])
         return np.asarray(self.stated / np.square(factor[self.source]))
 
+    @property
+    def measured(self) -> tuple[NDArray, NDArray]:
+        """(T, K, 3) [m] as measured, NaN where unobserved, and (K,) [m] stated sigma, 1 of markers never observed."""
+        x, weight = room(self.places.shape), self.stated.max(axis=0)
+        x[:] = np.where(self.stated[..., None] > 0.0, self.places, np.nan)
+        return x, 1.0 / np.sqrt(np.where(weight > 0.0, weight, 1.0))
+
     def part(self, frames: slice) -> PackedMarkers:
         """The markers of some frames."""
         return replace(self, places=self.places[frames], stated=self.stated[frames], times=self.times[frames])
