@@ -69,21 +69,25 @@ def test_information_and_lasting_errors_are_sums_over_rows_and_frames(tracked, p
                 pushes[-1][channel, i % 3] = w[i] * J[i]
                 stated.setdefault((channel, i % 3), []).append(m.lasts / rows.weight[i])
                 followed.setdefault(channel, []).append(left[i])
-        assert np.allclose(found.pooled(f, 0)[0], information, rtol=1e-9, atol=1e-9 * information.max())
+        assert np.allclose(found.pooled(f, 0), information, rtol=1e-9, atol=1e-9 * information.max())
     (components,) = found.components.values()
     unseen = 5.0 / (5.0 + 3.0 * sum(1.0 - np.mean(values) for values in followed.values()))  # of what is stated
     assert 0.03 < unseen < 0.3
     for f in range(T):
         near = pushes[max(f - HALF, 0) : f + HALF + 1]
-        expected, shared = np.zeros((n, n)), np.zeros((3, n))
+        expected, shared = np.zeros((2, n, n)), np.zeros((3, n))
         for (channel, axis), values in stated.items():
             mean = sum((of.get((channel, axis), np.zeros(n)) for of in near), np.zeros(n)) / len(near)
             shared[axis] += components.shared[0][axis] * mean
             lasting = components.systematic[channel] ** 2
-            lasting += unseen * max(np.mean(values) - lasting, 0.0)
-            expected += lasting * np.outer(mean, mean)
-        expected += shared.T @ shared
-        assert np.allclose(found.pooled(f, 0)[1], expected, rtol=1e-4, atol=1e-5 * expected.max())
+            drift = components.drift[channel] ** 2 + unseen * max(np.mean(values) - lasting, 0.0)
+            constant = components.bias[channel] ** 2 + components.bias_error[channel] ** 2
+            expected += np.array([constant, drift])[:, None, None] * np.outer(mean, mean)
+        expected[0] += shared.T @ shared
+        of_frame = found.pushes(f)
+        for push, known in zip((of_frame.constant, of_frame.drift), expected):
+            assert np.allclose(push.T @ push, known, rtol=1e-4, atol=1e-5 * expected.max())
+        assert not np.any(of_frame.rest)
 
 
 class Surface(Matched):
@@ -112,7 +116,7 @@ def test_surfaces_move_the_pose_as_refitting_does(tracked, points):
     none = np.zeros((n, n))
     found = sensor_noise.other_noise(body, others, matched, take.roots, take.angles, lambda f: none, half=0)
     scene, (surface,) = others.scene(5, take.roots, take.angles), matched[5]
-    information, lasting = found.pooled(5, 0)
+    information, lasting = found.pooled(5, 0), found.pushes(5).rest
     alone = sensor_noise.covariance_alone(body, scene.state, information)
 
     def equations(error):

@@ -12,6 +12,7 @@ from kinefit.sensors.channels import make_channels
 from kinefit.sensors.points.keypoints import Layout
 from kinefit.sensors.settings import CameraErrors
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
+from kinefit.smoothing.sensor_noise import Pushes
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.uncertainty import KeypointPriors, systematic_errors
 from kinefit.solvers.least_squares import levenberg_marquardt
@@ -52,8 +53,9 @@ def covariance(scene, noise, Sigma=None, cameras=None):
     subject, channels, weight, state = scene
     known, layout = KeypointPriors.of(subject, channels, cameras), Layout(channels, subject.body)
     known = replace(known, covariance=np.zeros_like(known.covariance) if Sigma is None else Sigma)
-    none = np.zeros((subject.body.tree.n_dofs,) * 2)  # no other sensors
-    return systematic_errors(known, layout, state, weight, noise, SharedErrors.none(len(weight)), none, none)
+    n = subject.body.tree.n_dofs
+    none = np.zeros((n, n)), Pushes.none(n)  # no other sensors
+    return systematic_errors(known, layout, state, weight, noise, SharedErrors.none(len(weight)), *none)
 
 
 def noise_of(channels, drift=0.0, shift=None):
@@ -81,7 +83,8 @@ def test_drift_moves_the_pose_as_refitting_does(scene):
 def test_a_constant_error_changes_a_difference_of_frames_as_refitting_does(scene):
     subject, channels, _, _ = scene
     random = np.random.default_rng(1)
-    layout, none = Layout(channels, subject.body), np.zeros((subject.body.tree.n_dofs,) * 2)
+    layout, n = Layout(channels, subject.body), subject.body.tree.n_dofs
+    none = np.zeros((n, n)), Pushes.none(n)
     count = len(channels.column)
     noise = replace(noise_of(channels), bias=np.full(count, 2.0))
     exact = replace(KeypointPriors.of(subject, channels, None), covariance=np.zeros((len(subject.covariance),) * 2))
@@ -89,7 +92,7 @@ def test_a_constant_error_changes_a_difference_of_frames_as_refitting_does(scene
     for frame in (20, 40):
         weight = channels.weight[frame]
         state = fit(subject.body, channels, channels.uv[frame], weight, MOTION.state(frame))
-        one = systematic_errors(exact, layout, state, weight, noise, SharedErrors.none(count), none, none)
+        one = systematic_errors(exact, layout, state, weight, noise, SharedErrors.none(count), *none)
         np.testing.assert_allclose(one.constant @ one.constant.T, one.dofs, atol=1e-12)
         factors.append(one.constant)
         fits.append((frame, weight, state))

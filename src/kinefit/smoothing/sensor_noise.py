@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,43 @@ _Push = tuple[str, NDArray, NDArray, NDArray]
 """Rows of one sensor in one frame: its name; channels and axes (2, R), Σ w J (R, n) and Σ w (R,) of each."""
 
 
+class Pushes(NamedTuple):
+    """Gradients Jᵀ W e of the pose by systematic errors e of one standard deviation, in one frame.
+
+    Parameters
+    ----------
+    constant, drift : (k, n) of errors that last for the whole take, and of those that drift
+    rest : (n, n) Σ s sᵀ of the gradients s of errors that are others in every frame
+    """
+
+    constant: NDArray
+    drift: NDArray
+    rest: NDArray
+
+    @classmethod
+    def none(cls, n: int) -> Pushes:
+        """Of no sensor."""
+        return cls(np.zeros((0, n)), np.zeros((0, n)), np.zeros((n, n)))
+
+
+@dataclass(frozen=True, eq=False)
+class LastingPushes:
+    """Gradients by the systematic errors of sensors of one kind, in some frames.
+
+    Parameters
+    ----------
+    per_unit : of each of these frames (k, n) gradients by a unit of each error, averaged over the frames within the
+        correlation time of the motion
+    constant, drift : (k,) standard deviations of the errors
+    drift_time : [s] in which the correlation of the drift falls to 1/e
+    """
+
+    per_unit: Sequence[NDArray]
+    constant: NDArray
+    drift: NDArray
+    drift_time: float
+
+
 @dataclass(frozen=True, eq=False)
 class OtherNoise:
     """Information and systematic errors of all sensors but the keypoints.
@@ -47,23 +84,41 @@ class OtherNoise:
     Parameters
     ----------
     information : (T, n (n + 1) / 2) of every frame's rows, the upper triangle of each
-    systematic : (T, n (n + 1) / 2) Σ s sᵀ of the gradients s = Jᵀ W e of every systematic error e, with s averaged over
-        the frames within the correlation time of the motion
+    rest : (T, n (n + 1) / 2) as in `Pushes`
+    lasting : of each kind of sensor
+    frames : (K,) int, increasing, those of `lasting`
     components : {sensor: VarianceComponents [m]}
     """
 
     information: NDArray
-    systematic: NDArray
+    rest: NDArray
+    lasting: tuple[LastingPushes, ...]
+    frames: NDArray
     components: dict[str, VarianceComponents]
 
-    def pooled(self, f: int, half: int) -> tuple[NDArray, NDArray]:
-        """(n, n) information, averaged over `half` (int) frames to either side, and `systematic` (n, n) of a frame."""
-        return _square(self.information[max(f - half, 0) : f + half + 1].mean(axis=0)), _square(self.systematic[f])
+    def pooled(self, f: int, half: int) -> NDArray:
+        """(n, n) information, averaged over `half` (int) frames to either side."""
+        return _square(self.information[max(f - half, 0) : f + half + 1].mean(axis=0))
+
+    def pushes(self, f: int) -> Pushes:
+        """Of one of `frames`."""
+        k, rest = int(np.searchsorted(self.frames, f)), _square(self.rest[f])
+        per_unit = [one.per_unit[k] for one in self.lasting]
+        constant, drift = (
+            np.concatenate([np.zeros((0, len(rest))), *(std[:, None] * push for std, push in zip(stds, per_unit))])
+            for stds in ([one.constant for one in self.lasting], [one.drift for one in self.lasting])
+        )
+        return Pushes(constant, drift, rest)
+
+    @property
+    def drift_times(self) -> list[float]:
+        """[s] of each kind of sensor that drifts."""
+        return [one.drift_time for one in self.lasting if np.any(one.drift > 0.0)]
 
     def __add__(self, other: OtherNoise) -> OtherNoise:
         """The noise of both, of different sensors."""
         return OtherNoise(
-            self.information + other.information, self.systematic + other.systematic,
+            self.information + other.information, self.rest + other.rest, self.lasting + other.lasting, self.frames,
             {**self.components, **other.components},
         )  # fmt: skip
 
@@ -105,7 +160,7 @@ def leverages(J: NDArray, pushed: NDArray, alone: NDArray) -> NDArray:
 
 def other_noise(
     body: Body, others: OtherSensors, matched: Sequence[tuple[Matched, ...]], roots: NDArray, angles: NDArray,
-    pixels: Callable[[int], NDArray], *, half: int = 0, surfaces: bool = True,
+    pixels: Callable[[int], NDArray], *, half: int = 0, surfaces: bool = True, frames: NDArray | None = None,
 ) -> OtherNoise:  # fmt: skip
     """Estimate the noise of all sensors but the keypoints from their residuals at fitted states.
 
@@ -116,10 +171,11 @@ def other_noise(
     pixels : frame -> (n, n) information of its keypoints
     half : frames to either side within the correlation time of the motion
     surfaces : whether surface offsets count as systematic errors
+    frames : (K,) int, increasing, in which systematic errors are asked for; default: all
     """
     T = len(roots)
-    upper = np.triu_indices(body.tree.n_dofs)
-    information, skins, systematic = np.zeros((3, T, len(upper[0])))
+    upper, frames = np.triu_indices(body.tree.n_dofs), np.arange(T) if frames is None else frames
+    information, skins, rest = np.zeros((3, T, len(upper[0])))
     residuals, pushes = ChannelResiduals(), Spool[list[_Push]]()
     absorbed, stated = defaultdict[str, list[NDArray]](list), defaultdict[str, list[NDArray]](list)
     independent = set[str]()
@@ -153,33 +209,35 @@ def other_noise(
             for sensor, at, push, weight in pushed:
                 absorbed[sensor].append(np.vstack([at, leverages(push / weight[:, None], push, alone)]))
         pushes.append(pushed)
-    found, variance = {}, {}
+    found, stds = {}, {}
     for sensor, (values, _) in residuals.arrays(T).items():
         leverage = _means(absorbed[sensor], values.shape[1:]).mean(axis=1)
         noise = variance_components(values, others.times, leverage=leverage, jitter_leverage=leverage / (2 * half + 1))
         found[sensor] = noise
         stated_means = _means(stated[sensor], values.shape[1:])
-        variance[sensor] = _systematic(noise, leverage, stated_means, sensor in independent)
-    for f, (near, sums) in enumerate(_window_means(pushes, half, variance, body.tree.n_dofs)):
-        pushed_by = [skins[near].mean(axis=0)]
-        for sensor, mean in sums.items():
-            shared = found[sensor].shared[0][:, None] * mean.sum(axis=0)
-            both = np.concatenate([(np.sqrt(variance[sensor])[..., None] * mean).reshape(-1, mean.shape[2]), shared])
-            pushed_by.append(gram(both, both)[upper])
-        systematic[f] = np.sum(pushed_by, axis=0)
-    return OtherNoise(information, systematic, found)
+        stds[sensor] = _lasting(noise, leverage, stated_means, sensor in independent)
+    per_unit, asked = {sensor: Spool[NDArray]() for sensor in found}, set(frames.tolist())
+    for f, (near, sums) in enumerate(_window_means(pushes, half, stds, body.tree.n_dofs)):
+        rest[f] = skins[near].mean(axis=0)
+        for sensor, mean in sums.items() if f in asked else ():
+            per_unit[sensor].append(_with_shared(mean).astype(np.float32))
+    lasting = tuple(
+        LastingPushes(per_unit[sensor], constant.ravel(), drift.ravel(), found[sensor].drift_time)
+        for sensor, (constant, drift) in stds.items()
+    )  # fmt: skip
+    return OtherNoise(information, rest, lasting, frames, found)
 
 
 def noise_of_sensors(
     take: SmoothTake, matched: Sequence[tuple[Matched, ...]] | None, pixels: Callable[[int], NDArray], *,
-    half: int = 0, surfaces: bool = True,
+    half: int = 0, surfaces: bool = True, frames: NDArray | None = None,
 ) -> OtherNoise | None:  # fmt: skip
     """Estimate the noise of all sensors but the keypoints, packed markers too; None without such sensors.
 
     Parameters
     ----------
     matched : T lists of matches of `take.others`; None without them
-    pixels, half, surfaces : see `other_noise`
+    pixels, half, surfaces, frames : see `other_noise`
     """
     body, roots, angles, markers = take.body, take.roots, take.angles, take.markers
     of_markers = None if markers is None else marker_information(body, markers, roots, angles)
@@ -189,14 +247,16 @@ def noise_of_sensors(
 
     others = None
     if take.others is not None and matched is not None:
-        others = other_noise(body, take.others, matched, roots, angles, points, half=half, surfaces=surfaces)
+        others = other_noise(
+            body, take.others, matched, roots, angles, points, half=half, surfaces=surfaces, frames=frames
+        )
     if markers is None or of_markers is None:
         return others
 
     def rest(f: int) -> NDArray:
         return pixels(f) if others is None else pixels(f) + _square(others.information[f])
 
-    found = marker_noise(body, markers, of_markers, roots, angles, rest, half=half)
+    found = marker_noise(body, markers, of_markers, roots, angles, rest, half=half, frames=frames)
     return found if others is None else found + others
 
 
@@ -219,7 +279,7 @@ def marker_matrices(body: Body, markers: PackedMarkers, roots: NDArray, angles: 
 
 def marker_noise(
     body: Body, markers: PackedMarkers, information: NDArray, roots: NDArray, angles: NDArray,
-    rest: Callable[[int], NDArray], *, half: int = 0,
+    rest: Callable[[int], NDArray], *, half: int = 0, frames: NDArray | None = None,
 ) -> OtherNoise:  # fmt: skip
     """Estimate the noise of packed markers from their residuals at fitted states, as `other_noise` does.
 
@@ -228,9 +288,10 @@ def marker_noise(
     information : of `marker_information`
     roots, angles : (T, 4, 4), (T, D) fitted
     rest : frame -> (n, n) information of all other sensors, keypoints too
-    half : frames to either side within the correlation time of the motion
+    half, frames : see `other_noise`
     """
     T, K = len(roots), len(markers.points)
+    frames = np.arange(T) if frames is None else frames
     gaps, weight = room(markers.places.shape), room(markers.stated.shape)
     for some in stretches(T):
         part = markers.part(some)
@@ -247,8 +308,8 @@ def marker_noise(
             lines, w = J[own].reshape(-1, body.tree.n_dofs), np.repeat(weight[f, own], 3)[:, None]
             absorbed[own] += leverages(lines, w * lines, alone).reshape(-1, 3).mean(axis=1)
             count[own] += 1
-    found, variance, shared = {}, np.zeros((K, 3)), np.zeros((len(markers.sensors), 3, K))
-    for q, sensor in enumerate(markers.sensors):
+    found, stds, drift_time = {}, {}, np.inf
+    for sensor in markers.sensors:
         own = markers.columns(sensor)
         leverage = filled(absorbed[own], count[own])
         noise = variance_components(
@@ -257,25 +318,28 @@ def marker_noise(
         seen = weight[:, own] > 0.0
         stated = np.where(seen, 1.0 / np.where(seen, markers.stated[:, own], 1.0), 0.0)
         stated = MarkerMatched.lasts * filled(stated.sum(axis=0), np.count_nonzero(seen, axis=0))
-        found[sensor], shared[q][:, own] = noise, noise.shared[0][:, None]
-        variance[own] = _systematic(noise, leverage, np.repeat(stated[:, None], 3, axis=1), MarkerMatched.independent)
-    systematic, upper = room(information.shape), np.triu_indices(body.tree.n_dofs)
-    posture = np.zeros((body.tree.n_dofs, body.tree.n_dofs))  # away from its mean a posture lasts: frames repeat the
-    posture[6:, 6:] = body.tree.posture_precision  # same error of the prior, which counts where the cost is flat
+        found[sensor], drift_time = noise, min(drift_time, noise.drift_time)
+        stds[sensor] = _lasting(noise, leverage, np.repeat(stated[:, None], 3, axis=1), MarkerMatched.independent)
+    per_unit = Spool[NDArray]()
     for some in stretches(T, MATRIX_FRAMES):
-        frames = np.arange(some.start, some.stop)
-        first, stop = np.maximum(frames - half, 0), np.minimum(frames + half + 1, T)
+        asked = frames[(frames >= some.start) & (frames < some.stop)]
+        first, stop = np.maximum(asked - half, 0), np.minimum(asked + half + 1, T)
+        if not len(asked):
+            continue
         pushes = np.zeros((stop[-1] - first[0] + 1, K, 3, body.tree.n_dofs))
         for f in range(first[0], stop[-1]):
             pushes[f - first[0] + 1] = weight[f, :, None, None] * point_derivatives(
                 body, BodyState(roots[f], angles[f]), markers.points
             )
         total = np.cumsum(pushes, axis=0)
-        mean = (total[stop - first[0]] - total[first - first[0]]) / (stop - first)[:, None, None, None]
-        own, common = np.sqrt(variance)[..., None] * mean, np.einsum("qak,fkan->fqan", shared, mean)
-        both = np.concatenate([each.reshape(len(frames), -1, body.tree.n_dofs) for each in (own, common)], axis=1)
-        systematic[some] = (both.transpose(0, 2, 1) @ both + posture)[:, upper[0], upper[1]]
-    return OtherNoise(information, systematic, found)
+        for mean in (total[stop - first[0]] - total[first - first[0]]) / (stop - first)[:, None, None, None]:
+            of_sensors = [_with_shared(mean[markers.columns(sensor)]) for sensor in markers.sensors]
+            per_unit.append(np.concatenate(of_sensors).astype(np.float32))
+    constant, drift = (np.concatenate([std[k].ravel() for std in stds.values()]) for k in (0, 1))
+    lasting = LastingPushes(per_unit, constant, drift, drift_time)
+    posture = block_diagonal(np.zeros((6, 6)), body.tree.posture_precision)  # frames repeat the same error of the prior,
+    rest = np.broadcast_to(posture[np.triu_indices(len(posture))], information.shape)  # seen where the cost is flat
+    return OtherNoise(information, rest, (lasting,), frames, found)
 
 
 def filled(total: NDArray, count: NDArray) -> NDArray:
@@ -283,17 +347,27 @@ def filled(total: NDArray, count: NDArray) -> NDArray:
     return np.where(count > 0, total / np.maximum(count, 1), total.sum() / max(float(count.sum()), 1.0))
 
 
-def _systematic(found: VarianceComponents, leverage: NDArray, stated: NDArray, independent: bool) -> NDArray:
-    """(C, A) variance of systematic errors: the estimate, plus a share of what `stated` (C, A) exceeds it by.
+def _lasting(
+    found: VarianceComponents, leverage: NDArray, stated: NDArray, independent: bool
+) -> tuple[NDArray, NDArray]:
+    """(C + 1, A) standard deviations of constant errors and of those that drift; the last row is what channels share.
 
-    The share falls with the number of independent channels, each counted by 1 − leverage (C,): their residuals would
-    show a larger error. `stated` itself counts as `_STATED_CHANNELS` channels. If channels are not independent, the fit
-    absorbs their common error, and the share is 1.
+    What `stated` (C, A), a variance, exceeds the estimate by, drifts: at least for as long as a posture lasts. A share
+    of it counts, which falls with the number of independent channels, each counted by 1 − leverage (C,): their
+    residuals would show a larger error. `stated` itself counts as `_STATED_CHANNELS` channels. If channels are not
+    independent, the fit absorbs their common error, and the share is 1.
     """
-    estimated = found.systematic[:, None] ** 2
     channels = stated.shape[1] * float(np.sum(np.clip(1.0 - leverage, 0.0, 1.0))) if independent else 0.0
     share = _STATED_CHANNELS / (_STATED_CHANNELS + channels)
-    return np.asarray(estimated + share * np.maximum(stated - estimated, 0.0))
+    excess = share * np.maximum(stated - found.systematic[:, None] ** 2, 0.0)
+    constant = np.broadcast_to(np.hypot(found.bias, found.bias_error)[:, None], stated.shape)
+    drift = np.sqrt(found.drift[:, None] ** 2 + excess)
+    return np.vstack([constant, found.shared[0]]), np.vstack([drift, np.zeros(stated.shape[1])])
+
+
+def _with_shared(pushes: NDArray) -> NDArray:
+    """(C A + A, n) gradients by the errors of channels (C, A, n), and by an error that all share."""
+    return np.concatenate([pushes, pushes.sum(axis=0)[None]]).reshape(-1, pushes.shape[2])
 
 
 def _summed(at: NDArray, push: NDArray, weight: NDArray) -> tuple[NDArray, NDArray, NDArray]:
@@ -315,10 +389,10 @@ def _means(entries: Sequence[NDArray], shape: tuple[int, ...]) -> NDArray:
 
 
 def _window_means(
-    pushes: Spool[list[_Push]], half: int, channels: Mapping[str, NDArray], n: int
+    pushes: Spool[list[_Push]], half: int, stds: Mapping[str, tuple[NDArray, NDArray]], n: int
 ) -> Iterator[tuple[slice, dict[str, NDArray]]]:
     """For every frame the window of `half` frames to either side, and each sensor's mean w J (C, A, n) over it."""
-    T, sums = len(pushes), {sensor: np.zeros((*variance.shape, n)) for sensor, variance in channels.items()}
+    T, sums = len(pushes), {sensor: np.zeros((len(std) - 1, std.shape[1], n)) for sensor, (std, _) in stds.items()}
     for last in range(T + half):
         for f, sign in ((last, 1.0), (last - 2 * half - 1, -1.0)):
             for sensor, at, push, _ in pushes[f] if 0 <= f < T else ():

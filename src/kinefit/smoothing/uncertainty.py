@@ -25,13 +25,13 @@ from kinefit.bodies import BodyState, KinematicTree
 from kinefit.correspondences import _kernels, targets
 from kinefit.correspondences.closures import closed_at
 from kinefit.frame.results import FrameResult
-from kinefit.lasting_errors import LastingErrors
+from kinefit.lasting_errors import LastingErrors, key_frames
 from kinefit.rows import Rows
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.points.keypoints import Layout
 from kinefit.sensors.settings import CameraErrors
 from kinefit.smoothing.process_noise import SmoothTake
-from kinefit.smoothing.sensor_noise import OtherNoise, covariance_alone, filled, leverages
+from kinefit.smoothing.sensor_noise import OtherNoise, Pushes, covariance_alone, filled, leverages
 from kinefit.smoothing.shape_errors import SAMPLED_FRAMES, ShapeErrors
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import stretches
@@ -49,9 +49,8 @@ Answers = Callable[[Sequence[int], Sequence[NDArray]], ShapeErrors]
 MOTION_CORRELATION_TIME = 0.1
 """[s] within which the motion correlates frames: an acceleration lasts about twice that."""
 
-_KEY_FRAMES_PER_S = 20.0  # of lasting errors. The sigma of differences on the balancing trial is within 2.6 % of that
-# with every frame, 0.5 % for nine tenths; with 10 a second within 8 %.
-_DIRECTIONS = 120  # of lasting errors that are kept. Likewise: 120 within 0.3 %, 60 within 6 %, 20 within 43 %
+_DIRECTIONS = 120  # of lasting errors that are kept. The sigma of differences on the balancing trial is within 0.3 %
+# of that with all; with 60 within 6 %, with 20 within 43 %
 _NOISE_STRETCHES = 6  # of a long take, from which the detectors' noise is estimated: 12,000 frames are enough
 _SEPARATING_FRAMES = 800  # without detections between two stretches: more than the longest lag, at up to 400 Hz
 
@@ -65,8 +64,7 @@ class SystematicErrors:
     dofs : (n, n) covariance of the degrees of freedom [m, rad]
     joints : (S, 3) [m²] variance of the joint centres along the world's axes
     alone : (n, n) covariance of the frame on its own, prior included
-    constant, drift : (n, k) factors of what of `dofs` comes from constant errors of keypoints and the shape, and from
-        drift
+    constant, drift : (n, k) factors of what of `dofs` comes from constant errors and the shape, and from drift
     """
 
     dofs: NDArray
@@ -101,11 +99,11 @@ def with_systematic_errors(
     shared = shared or SharedErrors.none(len(channels.column))
     layout = Layout(channels.with_points(body), body)
     half, n = round(MOTION_CORRELATION_TIME * rate), body.tree.n_dofs
-    sampled = np.unique(np.linspace(0, len(results) - 1, min(SAMPLED_FRAMES, len(results))).astype(int))
+    sampled = _sampled(len(results))
     absorbed, count = np.zeros((2, len(channels.column)))
     for f in sampled:
         rows, J, pushed = pixel_columns(layout, results[f].state, weight[f], shared)
-        whole = gram(J, pushed) + (0.0 if others is None else others.pooled(f, half)[0])
+        whole = gram(J, pushed) + (0.0 if others is None else others.pooled(f, half))
         used = rows.weight > 0.0
         leverage = leverages(J[used], pushed[used], covariance_alone(body, results[f].state, whole))
         absorbed += np.bincount(rows.group[used], leverage, len(absorbed))
@@ -120,21 +118,22 @@ def with_systematic_errors(
     )  # fmt: skip
     del values
     priors = KeypointPriors.of(subject, channels, cameras)
-    zero = np.zeros((n, n)), np.zeros((n, n))
+    nothing = np.zeros((n, n)), Pushes.none(n)
 
     def errors_at(f: int) -> SystematicErrors:
-        other_sensors = zero if others is None else others.pooled(f, half)
+        other_sensors = nothing if others is None else (others.pooled(f, half), others.pushes(f))
         near = weight[max(f - half, 0) : f + half + 1]
         return systematic_errors(priors, layout, results[f].state, near.mean(axis=0), noise, shared, *other_sensors)
 
     few = {f: errors_at(f) for f in sampled.tolist()}
     shapes = [answer(list(few), [errors.alone for errors in few.values()]) for answer in answers]
-    kept = _KeyFrames.of(few, shapes, len(results), rate, noise.drift_time)
+    drift_times = [noise.drift_time] if others is None or np.any(noise.drift > 0.0) else []
+    drift_times += [] if others is None else others.drift_times
+    kept = _KeyFrames.of(few, shapes, len(results), rate, min(drift_times, default=np.inf))
 
     def variances() -> Iterator[tuple[NDArray, NDArray]]:
         """Of every frame's degrees of freedom and joints: interpolated between key frames two or more frames apart."""
-        keys = kept.errors.frames
-        keys = keys if np.diff(keys).min(initial=2) >= 2 else np.arange(len(results))
+        keys = _computed(len(results), rate)
         before, now = (np.zeros(0), np.zeros(0)), (np.zeros(0), np.zeros(0))
         for last, f in pairwise([-1, *keys.tolist()]):
             errors = few.pop(f, None) or errors_at(f)
@@ -155,6 +154,21 @@ def with_systematic_errors(
             )  # fmt: skip
 
     return inflated(), noise, kept.errors
+
+
+def _computed(frames: int, rate: float) -> NDArray:
+    """Frames in which errors are computed: key frames, all where these lie close."""
+    keys = key_frames(frames, rate)
+    return keys if np.diff(keys).min(initial=2) >= 2 else np.arange(frames)
+
+
+def _sampled(frames: int) -> NDArray:
+    return np.unique(np.linspace(0, frames - 1, min(SAMPLED_FRAMES, frames)).astype(int))
+
+
+def asked_frames(frames: int, rate: float) -> NDArray:
+    """(K,) int, increasing: of so many frames at a rate [Hz] those of which other sensors' errors are asked for."""
+    return np.union1d(_computed(frames, rate), _sampled(frames))
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,8 +194,7 @@ class _KeyFrames:
         all_constant = np.stack([_with_shapes(errors, shapes, f) for f, errors in few.items()])
         all_drift = np.stack([errors.drift for errors in few.values()])
         constant, drift = _directions(all_constant), _directions(all_drift)
-        count = min(frames, round(frames / rate * _KEY_FRAMES_PER_S) + 2)
-        keys = np.unique(np.linspace(0, frames - 1, count).round().astype(int))
+        keys = key_frames(frames, rate)
         s, d = (room((len(keys), all_drift.shape[1], v.shape[1]), np.float16) for v in (constant, drift))
         return cls(LastingErrors(keys, s, d, drift_time), constant, drift)
 
@@ -312,7 +325,7 @@ def pixel_information(take: SmoothTake, weight: NDArray, shared: SharedErrors | 
 
 def systematic_errors(
     priors: KeypointPriors, layout: Layout, state: BodyState, weight: NDArray,
-    noise: VarianceComponents, shared: SharedErrors, other_information: NDArray, other_systematic: NDArray,
+    noise: VarianceComponents, shared: SharedErrors, other_information: NDArray, others: Pushes,
 ) -> SystematicErrors:  # fmt: skip
     """Covariance of one frame's pose from bias, drift, shared biases of sensors and shape.
 
@@ -322,18 +335,19 @@ def systematic_errors(
     weight : (N,) [1/px²] of every channel in the fit, robust factor included; 0 where undetected
     noise : of the detectors
     shared : share of a channel's errors, of jitter and drift alike, that its group shares
-    other_information, other_systematic : (n, n) of all sensors but the keypoints, see `OtherNoise`
+    other_information : (n, n) of all sensors but the keypoints
+    others : of these
     """
     body, channels, tree = layout.body, layout.channels, layout.body.tree
     rows, J, pushed = pixel_columns(layout, state, weight, shared)
     frames, _ = tree.forward(state.T_world_root, state.angles)
     by_shape, stretch = priors.columns(layout, rows, tree, frames)
-    Sigma = priors.covariance
+    Sigma, rest = priors.covariance, others.rest
     if body.closures:
         closed = closed_at(body, state)
         w = closed.rows().weight
         soft = (w * ~closed.hard)[:, None] * closed.jacobian
-        other_systematic = other_systematic + soft.T @ closed.jacobian
+        rest = rest + soft.T @ closed.jacobian
     alone = covariance_alone(body, state, gram(J, pushed) + other_information)
     of_axis = 2 * channels.source[rows.group] + np.arange(len(rows)) % 2
     push = np.ravel(noise.shared)[:, None] * gram(np.eye(2 * len(noise.shared))[of_axis], pushed)
@@ -351,9 +365,10 @@ def systematic_errors(
         moved_by = priors.closing.at(state)
         pushed_by_shape[:, : moved_by.shape[1]] += closed.jacobian.T @ (w[:, None] * moved_by)
     response = -product(alone, pushed_by_shape)
-    constant = product(alone, np.concatenate([push, pushed_by(np.hypot(noise.bias, noise.bias_error))]).T)
-    drift = product(alone, pushed_by(noise.drift).T)
-    dofs = sum(product(v, v.T) for v in (constant, drift)) + product(product(alone, other_systematic), alone)
+    biases = pushed_by(np.hypot(noise.bias, noise.bias_error))
+    constant = product(alone, np.concatenate([push, biases, others.constant]).T)
+    drift = product(alone, np.concatenate([pushed_by(noise.drift), others.drift]).T)
+    dofs = sum(product(v, v.T) for v in (constant, drift)) + product(product(alone, rest), alone)
     moved = joint_moves(body, state)
     whole = product(moved, response) + stretch
     joints = np.sum(product(moved, dofs) * moved, axis=-1) + np.sum(product(whole, Sigma) * whole, axis=-1)

@@ -27,7 +27,12 @@ from kinefit.smoothing.shape_errors import shape_errors
 from kinefit.smoothing.smoother import as_tracked, smooth_results
 from kinefit.smoothing.spool import STRETCH, Spool
 from kinefit.smoothing.tracked_frames import TrackedFrames
-from kinefit.smoothing.uncertainty import MOTION_CORRELATION_TIME, pixel_information, with_systematic_errors
+from kinefit.smoothing.uncertainty import (
+    MOTION_CORRELATION_TIME,
+    asked_frames,
+    pixel_information,
+    with_systematic_errors,
+)
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.tracking.cameras import CAMERAS, LOOKS, as_record, cameras_apart, composed, contradictions
@@ -124,7 +129,7 @@ def motion_of(
     # the tracker's own frames hold the surfaces' errors already
     noise_of_others = noise_of_sensors(
         take, matched, pixel_information(take, weight, shared), half=round(MOTION_CORRELATION_TIME * rate),
-        surfaces=smooth or lag is not None,
+        surfaces=smooth or lag is not None, frames=asked_frames(len(results), rate),
     )  # fmt: skip
     if noise_of_others is not None:
         provenance["sensor noise"] = noise_of_others.summary()
