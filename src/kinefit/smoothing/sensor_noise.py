@@ -212,7 +212,7 @@ def other_noise(
     found, stds = {}, {}
     for sensor, (values, _) in residuals.arrays(T).items():
         leverage = _means(absorbed[sensor], values.shape[1:]).mean(axis=1)
-        noise = variance_components(values, others.times, leverage=leverage, jitter_leverage=leverage / (2 * half + 1))
+        noise = variance_components(values, others.times, leverage=leverage, window=2 * half + 1)
         found[sensor] = noise
         stated_means = _means(stated[sensor], values.shape[1:])
         stds[sensor] = _lasting(noise, leverage, stated_means, sensor in independent)
@@ -312,9 +312,7 @@ def marker_noise(
     for sensor in markers.sensors:
         own = markers.columns(sensor)
         leverage = filled(absorbed[own], count[own])
-        noise = variance_components(
-            gaps[:, own], markers.times, leverage=leverage, jitter_leverage=leverage / (2 * half + 1)
-        )
+        noise = variance_components(gaps[:, own], markers.times, leverage=leverage, window=2 * half + 1)
         seen = weight[:, own] > 0.0
         stated = np.where(seen, 1.0 / np.where(seen, markers.stated[:, own], 1.0), 0.0)
         stated = MarkerMatched.lasts * filled(stated.sum(axis=0), np.count_nonzero(seen, axis=0))
@@ -337,9 +335,10 @@ def marker_noise(
             per_unit.append(np.concatenate(of_sensors).astype(np.float32))
     constant, drift = (np.concatenate([std[k].ravel() for std in stds.values()]) for k in (0, 1))
     lasting = LastingPushes(per_unit, constant, drift, drift_time)
-    posture = block_diagonal(np.zeros((6, 6)), body.tree.posture_precision)  # frames repeat the same error of the prior,
-    rest = np.broadcast_to(posture[np.triu_indices(len(posture))], information.shape)  # seen where the cost is flat
-    return OtherNoise(information, rest, (lasting,), frames, found)
+    posture = block_diagonal(np.zeros((6, 6)), body.tree.posture_precision)
+    # Neighbouring frames repeat the same error of the prior, which counts where the cost is flat.
+    of_prior = np.broadcast_to(posture[np.triu_indices(len(posture))], information.shape)
+    return OtherNoise(information, of_prior, (lasting,), frames, found)
 
 
 def filled(total: NDArray, count: NDArray) -> NDArray:
@@ -361,7 +360,7 @@ def _lasting(
     share = _STATED_CHANNELS / (_STATED_CHANNELS + channels)
     excess = share * np.maximum(stated - found.systematic[:, None] ** 2, 0.0)
     constant = np.broadcast_to(np.hypot(found.bias, found.bias_error)[:, None], stated.shape)
-    drift = np.sqrt(found.drift[:, None] ** 2 + excess)
+    drift = np.sqrt(found.smoothed_drift[:, None] ** 2 + excess)
     return np.vstack([constant, found.shared[0]]), np.vstack([drift, np.zeros(stated.shape[1])])
 
 

@@ -113,7 +113,7 @@ def with_systematic_errors(
         absorbed = 1.0 - (1.0 - absorbed) * (1.0 - channels.view_followed)
     values = _residuals(take)
     noise = variance_components(
-        values, np.arange(len(values)) / rate, leverage=absorbed, jitter_leverage=absorbed / (2 * half + 1),
+        values, np.arange(len(values)) / rate, leverage=absorbed, window=2 * half + 1,
         pool=np.minimum(channels.column, channels.column[channels.partner]), group=channels.source,
     )  # fmt: skip
     del values
@@ -367,7 +367,7 @@ def systematic_errors(
     response = -product(alone, pushed_by_shape)
     biases = pushed_by(np.hypot(noise.bias, noise.bias_error))
     constant = product(alone, np.concatenate([push, biases, others.constant]).T)
-    drift = product(alone, np.concatenate([pushed_by(noise.drift), others.drift]).T)
+    drift = product(alone, np.concatenate([pushed_by(noise.smoothed_drift), others.drift]).T)
     dofs = sum(product(v, v.T) for v in (constant, drift)) + product(product(alone, rest), alone)
     moved = joint_moves(body, state)
     whole = product(moved, response) + stretch

@@ -49,6 +49,21 @@ def test_gaps_change_no_component():
         assert np.median(getattr(gaps, name)) == pytest.approx(np.median(getattr(whole, name)), rel=0.15)
 
 
+@pytest.mark.parametrize("half", [0, 3, 9])
+def test_a_smoothing_fit_follows_the_mean_of_an_error(half):
+    """Half of all directions follow the mean over a window; the components are those before the fit."""
+    window, e = 2 * half + 1, errors(shape=(90, 3), drift=4.0, jitter=2.0)
+    mean = np.apply_along_axis(np.convolve, 0, e, np.full(window, 1.0 / window), "same")
+    basis = np.linalg.qr(np.random.default_rng(4).normal(size=(90, 45)))[0]
+    left = (e - np.einsum("ck,dk,fda->fca", basis, basis, mean))[half : len(e) - half]
+    found = variance_components(left, TIMES[: len(left)], leverage=np.full(90, 0.5), window=window)
+    assert np.median(found.jitter) == pytest.approx(2.0, rel=0.3)
+    assert np.median(found.drift) == pytest.approx(4.0, rel=0.25)
+    drift = errors(shape=(90, 3), drift=1.0)
+    smoothed = np.apply_along_axis(np.convolve, 0, drift, np.full(window, 1.0 / window), "valid")
+    assert found.smoothed_drift[0] / found.drift[0] == pytest.approx(smoothed.std(), rel=0.15)
+
+
 @pytest.mark.parametrize("always", [False, True])
 def test_outliers_are_neither_drift_nor_bias(always):
     residuals, random = errors(jitter=3.0), np.random.default_rng(2)

@@ -43,6 +43,7 @@ class VarianceComponents:
     drift_time : [s] time constant of the drift, in which its correlation falls to 1/e
     bias_error : (C,) square root of the standard error of bias², from jitter and drift
     outlier : (F, C) bool, residuals that were excluded
+    drift_share : share of the drift's variance that is left in its mean over the frames that a smoothing fit averages
     """
 
     bias: NDArray
@@ -52,6 +53,12 @@ class VarianceComponents:
     drift_time: float
     bias_error: NDArray
     outlier: NDArray
+    drift_share: float = 1.0
+
+    @property
+    def smoothed_drift(self) -> NDArray:
+        """(C,) standard deviation of the drift's mean over the frames that a smoothing fit averages."""
+        return np.asarray(np.sqrt(self.drift_share) * self.drift)
 
     @property
     def systematic(self) -> NDArray:
@@ -69,8 +76,8 @@ class VarianceComponents:
 
 
 def variance_components(
-    residuals: NDArray, times: NDArray | None = None, *, leverage: NDArray | None = None,
-    jitter_leverage: NDArray | None = None, pool: NDArray | None = None, group: NDArray | None = None,
+    residuals: NDArray, times: NDArray | None = None, *, leverage: NDArray | None = None, window: int = 1,
+    pool: NDArray | None = None, group: NDArray | None = None,
 ) -> VarianceComponents:  # fmt: skip
     """Estimate bias, drift and jitter from the residuals of a fit.
 
@@ -78,9 +85,9 @@ def variance_components(
     ----------
     residuals : (F, C, A) measured minus fitted, NaN where missing
     times : (F,) [s], increasing; None for frames so far apart that their drift is uncorrelated: it counts as jitter
-    leverage : (C,) share of the variance of each channel's bias and drift that the fit absorbs; below 0 where it adds
-        errors of other channels; default: 0
-    jitter_leverage : (C,) the same of jitter, of which a smoothing fit absorbs less; default: `leverage`
+    leverage : (C,) share of the variance of each channel's bias that the fit absorbs; below 0 where it adds errors of
+        other channels; default: 0
+    window : consecutive frames whose errors a smoothing fit averages: of jitter and drift it absorbs less
     pool : (C,) int, channels of one number have the same standard deviations; default: all
     group : (C,) int from 0, channels of one number share a bias; default: all
     """
@@ -102,16 +109,26 @@ def variance_components(
     drift2 = np.minimum(drift2, systematic2)
     of_mean = np.maximum(jitter2 + drift2 - within, 0.0)  # variance of a channel's mean from jitter and drift
     error2 = of_mean * np.sqrt(2.0 / np.maximum(np.bincount(pool, axes), 1))
-    leverage = np.zeros(C) if leverage is None else leverage
-    factor, jitter_factor = (
-        _inflation(1.0 - _mean_of_pools(absorbed, count, pool))
-        for absorbed in (leverage, leverage if jitter_leverage is None else jitter_leverage)
-    )
-    pooled2, drift2, error2 = ((v * factor)[pool] for v in (systematic2 - drift2, drift2, error2))
-    jitter2 = (jitter2 * jitter_factor)[pool]
+    leverage = _mean_of_pools(np.zeros(C) if leverage is None else leverage, count, pool)
+    # The fit takes h d̄ from an error d, with d̄ its mean over the window and h the leverage of an error that lasts.
+    lasting, with_mean = _averaged(window, times, drift_time)
+    absorbed = np.array([[1.0], [2.0 * with_mean - lasting], [1.0 / window]]) * leverage
+    factor, drift_factor, jitter_factor = _inflation(1.0 - absorbed)
+    pooled2, error2 = ((v * factor)[pool] for v in (systematic2 - drift2, error2))
+    drift2, jitter2 = (drift2 * drift_factor)[pool], (jitter2 * jitter_factor)[pool]
     bias2 = pooled2 + (bias2 - clipped)
     bias, drift, jitter, error = (np.sqrt(v) for v in (bias2, drift2, jitter2, error2))
-    return VarianceComponents(bias, drift, jitter, shared, drift_time, error, outlier)
+    return VarianceComponents(bias, drift, jitter, shared, drift_time, error, outlier, lasting)
+
+
+def _averaged(window: int, times: NDArray | None, drift_time: float) -> tuple[float, float]:
+    """Variance of the mean of a drift of variance 1 over a window of frames, and its covariance with the middle one."""
+    frames = np.arange(window)
+    if times is None or len(times) < 2:
+        correlation = np.eye(window)
+    else:
+        correlation = np.exp(-np.abs(frames - frames[:, None]) * float(np.median(np.diff(times))) / drift_time)
+    return float(correlation.mean()), float(correlation[window // 2].mean())
 
 
 def _inflation(remaining: NDArray) -> NDArray:
