@@ -44,6 +44,19 @@ def test_what_was_not_observed_takes_no_part():
     assert extremes(curve(MAX_STD_DEG), MOTION, np.ones(101, bool)) is None
 
 
+@pytest.mark.parametrize(("segment", "part"), [("shank_l", True), ("thigh_l", True), ("foot_l", False)])
+def test_frames_in_which_a_limb_is_lost_take_no_part(segment, part):
+    motion = smooth_motion(40)
+    quality, angles = np.ones((40, len(motion.body.tree.segments))), np.array(motion.angles)
+    angles[10:20, list(motion.body.tree.coordinates).index("knee_angle_l")] += np.radians(100.0)
+    quality[8:22, motion.body.tree.segment(segment)] = 0.1
+    std = np.full_like(motion.dof_std, 0.01)
+    found = ranges_of(replace(motion, quality=np.ones(40), segment_quality=quality, dof_std=std, angles=angles))
+    knee = found["knee_angle"]["left"]
+    assert knee.share == pytest.approx(26 / 40 if part else 1.0) and (knee.span[0] < 90.0) == part
+    assert found["knee_angle"]["right"].share == 1.0
+
+
 def test_what_both_ends_have_in_common_is_not_in_the_range():
     motion = smooth_motion(40)
     motion = replace(motion, quality=np.ones(40), dof_std=np.full_like(motion.dof_std, np.radians(5.0)))

@@ -184,7 +184,7 @@ class Extremes:
 def extremes(curve: Curve, motion: Motion, tracked: NDArray) -> Extremes | None:
     """Of one angle [deg] of a motion over time; None where it was observed in no two frames.
 
-    tracked : (F,) bool, frames in which somebody was seen.
+    tracked : (F,) bool, frames in which somebody was seen and the segments on both sides of the joint are not lost.
     """
     known = tracked & (curve.std < MAX_STD_DEG)
     if known.sum() < 2:
@@ -211,11 +211,16 @@ def ranges_of(motion: Motion) -> dict[str, dict[str, Extremes | None]]:
 
     None stands for what was observed in no two frames.
     """
-    tracked = motion.quality > 0
+    tree, believed = motion.body.tree, (motion.quality > 0)[:, None] & ~motion.lost
+
+    def tracked(curve: Curve) -> NDArray:
+        segment = 0 if curve.coordinate is None else int(tree.owners[curve.coordinate - 6])
+        return np.asarray(believed[:, segment] & believed[:, max(int(tree.parents[segment]), 0)])
+
     out: dict[str, dict[str, Extremes | None]] = {}
     for rows in by_joint(curves(motion)).values():
         for stem, found in rows.items():
-            of = {c.side: extremes(c, motion, tracked) for c in found if c.unit == "deg"}
+            of = {c.side: extremes(c, motion, tracked(c)) for c in found if c.unit == "deg"}
             if of:
                 out[stem] = of
     return out
