@@ -185,20 +185,30 @@ def covariance_blocks(W, below, past, since, frames, following, variance):
     WT, fall, cross, own = np.empty((p, p)), np.empty((3 * p, p)), np.empty((3 * p, p)), np.empty((p, p))
     both, line, part = np.empty((4 * p, p)), np.empty((p, 4 * p)), np.empty(4)
     for t in range(T - 1, since - 1, -1):
-        WT[:] = W[t].T
+        for i in range(p):
+            for j in range(p):
+                both[i, j] = WT[i, j] = W[t, j, i]
+                line[i, j] = W[t, i, j]
         product(below[t], WT, fall)
         product(ahead, fall, cross)
-        both[:p], both[p:] = WT, -cross
-        line[:, :p], line[:, p:] = W[t], -fall.T
+        for i in range(3 * p):
+            for j in range(p):
+                both[p + i, j] = -cross[i, j]
+                line[j, p + i] = -fall[i, j]
         product(line, both, own)
-        next_ahead[p:, p:] = ahead[: 2 * p, : 2 * p]
+        for i in range(2 * p):
+            for j in range(2 * p):
+                next_ahead[p + i, p + j] = ahead[i, j]
+            for j in range(p):
+                next_ahead[p + i, j] = next_ahead[j, p + i] = -cross[i, j]
         for i in range(p):
             for j in range(p):
                 next_ahead[i, j] = 0.5 * (own[i, j] + own[j, i])
-        next_ahead[p:, :p], next_ahead[:p, p:] = -cross[: 2 * p], -cross[: 2 * p].T
-        frames[t] = next_ahead[:n, :n]
-        if t + 1 < T:
-            following[t] = -cross[:n, :n]
+        for i in range(n):
+            for j in range(n):
+                frames[t, i, j] = next_ahead[i, j]
+                if t + 1 < T:
+                    following[t, i, j] = -cross[i, j]
         for change in range(t + 2 if t > 0 else 0, min(t + 3, T - 1)):
             back = min(change, 2)
             part[:] = 0.0
