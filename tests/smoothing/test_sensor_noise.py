@@ -83,6 +83,7 @@ def test_information_and_lasting_errors_are_sums_over_rows_and_frames(tracked, p
             lasting += unseen * max(np.mean(values) - lasting, 0.0)
             expected += lasting * np.outer(mean, mean)
         expected += shared.T @ shared
+        expected[6:, 6:] += body.tree.posture_precision if packed else 0.0  # the error of the posture prior lasts
         assert np.allclose(found.pooled(f, 0)[1], expected, rtol=1e-4, atol=1e-5 * expected.max())
 
 
