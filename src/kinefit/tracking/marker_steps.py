@@ -21,7 +21,6 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.solvers.equations import inverse
-from kinefit.solvers.sequence import fit_sequence
 from kinefit.solvers.trajectory.seen_points import SeenPoints
 from kinefit.solvers.trajectory.smoothing import unpacked
 from kinefit.subject.subject import Progress
@@ -65,7 +64,7 @@ def fit_marker_steps(
     for some in stretches(len(times), _SEQUENCE_FRAMES):
         part = markers.part(some)
         try:
-            roots[some], angles[some] = _refit_outliers(body, part, *_poses_after(last, body, part))
+            roots[some], angles[some] = _refit_outliers(body, part, *_poses(body, part, last))
         except TrackingError:
             return None
         last = BodyState(roots[some][-1], angles[some][-1])
@@ -74,20 +73,17 @@ def fit_marker_steps(
             progress("frames", some.stop, len(times))
     angles[:] = unwrap(body.tree, angles)
     nothing = _OnDemand(len(times), lambda f: ())
-    results = _judged(body, markers, roots, angles) if judge else _poses(body, times, roots, angles)
+    results = _judged(body, markers, roots, angles) if judge else _blank(body, times, roots, angles)
     return TrackedSteps(
         results, nothing, nothing, times, recording.rate, tracker.scene_of, tracker.apart, list(range(len(times))),
         tracker, True, markers=markers,
     )  # fmt: skip
 
 
-def _poses_after(last: BodyState | None, body: Body, markers: PackedMarkers) -> tuple[NDArray, NDArray]:
+def _poses(body: Body, markers: PackedMarkers, start: BodyState | None = None) -> tuple[NDArray, NDArray]:
     """Roots (F, 4, 4) and angles (F, D) [rad], fitted from the state before the first frame; None: without one."""
     x, sigma = markers.measured
-    if last is None:
-        return sequence_both_ways(body, markers.points, x, sigma, loss=markers.loss)
-    fit = fit_sequence(body, last, markers.points, x, sigma=sigma, loss=markers.loss, posture=1.0)
-    return fit.Ts_world_root, fit.angles
+    return sequence_both_ways(body, markers.points, x, sigma, start=start, loss=markers.loss)
 
 
 def _misfit(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> NDArray:
@@ -107,7 +103,7 @@ def _refit_outliers(
     for a, b in sorted(runs_of(is_outlier), key=lambda run: run[0] - run[1])[:_MAX_REFIT_RUNS]:
         part = markers.part(slice(a, b))
         try:
-            other_roots, other_angles = _poses_after(None, body, part)
+            other_roots, other_angles = _poses(body, part)
         except TrackingError:
             continue
         better = _misfit(body, part, other_roots, other_angles) < 0.9 * misfit[a:b]
@@ -152,7 +148,7 @@ class _OnDemand(Sequence[Any]):
         return self._make(f)
 
 
-def _poses(body: Body, times: NDArray, roots: NDArray, angles: NDArray) -> _OnDemand:
+def _blank(body: Body, times: NDArray, roots: NDArray, angles: NDArray) -> _OnDemand:
     """Fitted poses (F, 4, 4), (F, D) at times (F,) [s] as frames without standard deviations."""
     some = BodyState(roots[0], angles[0])
     std, joints = np.full(body.tree.n_dofs, np.inf), np.full((len(body.tree.segments), 3), np.inf)
