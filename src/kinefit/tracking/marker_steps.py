@@ -18,11 +18,9 @@ from kinefit.markers.poses import sequence_both_ways
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.sensors.settings import TrackSettings
+from kinefit.smoothing.sensor_noise import covariance_alone, marker_matrices
 from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.smoothing.unwrap import unwrap
-from kinefit.solvers.equations import inverse
-from kinefit.solvers.trajectory.seen_points import SeenPoints
-from kinefit.solvers.trajectory.smoothing import unpacked
 from kinefit.subject.subject import Progress
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import TrackedSteps, tracker_of
@@ -93,9 +91,7 @@ def _misfit(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray)
     return np.where(seen, np.minimum(np.nan_to_num(off), 10.0), 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
 
 
-def _refit_outliers(
-    body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray
-) -> tuple[NDArray, NDArray]:
+def _refit_outliers(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
     """Fit frames with an outlying misfit again without initial pose; keep the better fit."""
     roots, angles = roots.copy(), angles.copy()
     misfit = _misfit(body, markers, roots, angles)
@@ -114,14 +110,12 @@ def _refit_outliers(
 def _judged(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> Spool[FrameResult]:
     """Fitted poses (F, 4, 4), (F, D) as frames with the standard deviations of each frame on its own."""
     tree, out = body.tree, Spool[FrameResult]()
-    prior = np.zeros((tree.n_dofs, tree.n_dofs))
-    prior[6:, 6:] = tree.posture_precision
-    prior[:6, :6] = np.eye(6)
     for some in stretches(len(roots), MATRIX_FRAMES):
         part, at = markers.part(some), (roots[some], angles[some])
-        points = SeenPoints.in_metres(part.points, part.places, part.weight, part.loss)
-        information = unpacked(points.equations(body)(*at)[0], tree) + prior
-        covariances = np.stack([inverse(H) for H in information])
+        states = (BodyState(root, q) for root, q in zip(*at))
+        covariances = np.stack(
+            [covariance_alone(body, *each) for each in zip(states, marker_matrices(body, part, *at))]
+        )
         observed = np.sqrt(np.einsum("fii->fi", covariances))[:, 6:] <= UNOBSERVED_STD_RATIO * tree.spread
         for result in frame_results(
             body, *at, part.times, covariances, part.evidence(body, part.gaps(body, *at)), observed=observed,
