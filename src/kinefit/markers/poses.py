@@ -54,7 +54,7 @@ def columns(markers: Markers, names: Sequence[str]) -> NDArray:
 
 def sequence_both_ways(
     body: Body, points: PointSet, x: NDArray, sigma: NDArray, *, start: BodyState | None = None,
-    loss: Loss = MARKER_LOSS, limits: bool = True,
+    loss: Loss = MARKER_LOSS,
 ) -> tuple[NDArray, NDArray]:  # fmt: skip
     """Roots (F, 4, 4) and angles (F, D) [rad] of all frames, fitted forwards and backwards, each frame's better fit.
 
@@ -72,7 +72,7 @@ def sequence_both_ways(
     TrackingError
         No frame shows enough markers to start from.
     """
-    given: dict[str, Any] = {"sigma": sigma, "loss": loss, "limits": limits, "posture": 1.0}
+    given: dict[str, Any] = {"sigma": sigma, "loss": loss, "posture": 1.0}
     if start is None:
         first, start = _start(body, points, x, sigma)
         start = fit_sequence(body, start, points, x[: first + 1][::-1], **given).last

@@ -92,8 +92,7 @@ def _misfit(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray)
 
 
 def _refit_outliers(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
-    """Fit frames with an outlying misfit again without initial pose; keep the better fit."""
-    roots, angles = roots.copy(), angles.copy()
+    """Fit frames with an outlying misfit again without initial pose; the better fit replaces the other in place."""
     misfit = _misfit(body, markers, roots, angles)
     is_outlier = misfit > max(_OUTLIER_MISFIT_RATIO * float(np.median(misfit)), 3.0)
     for a, b in sorted(runs_of(is_outlier), key=lambda run: run[0] - run[1])[:_MAX_REFIT_RUNS]:
@@ -109,17 +108,15 @@ def _refit_outliers(body: Body, markers: PackedMarkers, roots: NDArray, angles: 
 
 def _judged(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> Spool[FrameResult]:
     """Fitted poses (F, 4, 4), (F, D) as frames with the standard deviations of each frame on its own."""
-    tree, out = body.tree, Spool[FrameResult]()
+    out = Spool[FrameResult]()
     for some in stretches(len(roots), MATRIX_FRAMES):
         part, at = markers.part(some), (roots[some], angles[some])
         states = (BodyState(root, q) for root, q in zip(*at))
-        covariances = np.stack(
-            [covariance_alone(body, *each) for each in zip(states, marker_matrices(body, part, *at))]
-        )
-        observed = np.sqrt(np.einsum("fii->fi", covariances))[:, 6:] <= UNOBSERVED_STD_RATIO * tree.spread
+        covariances = np.stack([covariance_alone(body, *s) for s in zip(states, marker_matrices(body, part, *at))])
+        observed = np.sqrt(np.einsum("fii->fi", covariances))[:, 6:] <= UNOBSERVED_STD_RATIO * body.tree.spread
         for result in frame_results(
             body, *at, part.times, covariances, part.evidence(body, part.gaps(body, *at)), observed=observed,
-            iterations=np.zeros(len(covariances), int).tolist(),
+            iterations=[0] * len(covariances),
         ):
             out.append(result)
     return out
