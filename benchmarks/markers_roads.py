@@ -1,6 +1,6 @@
 """`kinefit markers fit` and `kinefit track` on one file of labelled markers: the same body, poses, quality, lost limbs.
 
-Both through the commands' own functions, with defaults, on whole recordings. They are one road: what differs is a fault.
+Both through the commands' own functions, with defaults, on whole recordings: one road, so what differs is a fault.
 """
 
 from __future__ import annotations

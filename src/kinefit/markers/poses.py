@@ -1,4 +1,4 @@
-"""Fit the poses of a body to markers frame by frame, beginning at a frame fitted without initial pose."""
+"""Fit the poses of a body to markers frame by frame, from a frame fitted without initial pose."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from kinefit.solvers.sequence import fit_sequence
 
 _MIN_START_MARKERS = 6  # of the first frame
 _MIN_START_SIGMA = 0.03  # [m] error of a body that does not have the subject's size yet
+_MIN_FALL = 1.0  # of the cost to another, better minimum: less does not distinguish the two ends of a flat one
 _GOOD_START_DISTANCE = 0.03  # [m] median distance at which no further start is tried
 
 
@@ -52,27 +53,36 @@ def columns(markers: Markers, names: Sequence[str]) -> NDArray:
 
 
 def sequence_both_ways(
-    body: Body, points: PointSet, x: NDArray, sigma: NDArray, *, loss: Loss = MARKER_LOSS, limits: bool = True
-) -> tuple[NDArray, NDArray]:
-    """Roots (F, 4, 4) and angles (F, D) [rad] of all frames, fitted forwards and backwards from the best visible one.
+    body: Body, points: PointSet, x: NDArray, sigma: NDArray, *, start: BodyState | None = None,
+    loss: Loss = MARKER_LOSS,
+) -> tuple[NDArray, NDArray]:  # fmt: skip
+    """Roots (F, 4, 4) and angles (F, D) [rad] of all frames, fitted forwards and backwards, each frame's better fit.
+
+    A limb that is in a worse minimum stays there from frame to frame until the minima meet. The fit in the other
+    direction enters these frames from their far end, in the better one.
 
     Parameters
     ----------
     points : K points of the body
     x, sigma : (F, K, 3), (K,) [m] positions, NaN where not visible, and standard deviations
+    start : before the first frame; default: fitted without initial pose to the frame that shows most
 
     Raises
     ------
     TrackingError
         No frame shows enough markers to start from.
     """
-    first, state = _start(body, points, x, sigma)
-    given: dict[str, Any] = {"sigma": sigma, "loss": loss, "limits": limits, "posture": 1.0}
-    after = fit_sequence(body, state, points, x[first:], **given)
-    state = BodyState(after.Ts_world_root[0], after.angles[0])
-    before = fit_sequence(body, state, points, x[: first + 1][::-1], **given)
-    roots = np.concatenate([before.Ts_world_root[:0:-1], after.Ts_world_root])
-    return roots, np.concatenate([before.angles[:0:-1], after.angles])
+    given: dict[str, Any] = {"sigma": sigma, "loss": loss, "posture": 1.0}
+    if start is None:
+        first, start = _start(body, points, x, sigma)
+        start = fit_sequence(body, start, points, x[: first + 1][::-1], **given).last
+    ahead = fit_sequence(body, start, points, x, **given)
+    back = fit_sequence(body, ahead.last, points, x[::-1], **given)
+    better = back.costs[::-1] < ahead.costs - _MIN_FALL
+    return (
+        np.where(better[:, None, None], back.Ts_world_root[::-1], ahead.Ts_world_root),
+        np.where(better[:, None], back.angles[::-1], ahead.angles),
+    )
 
 
 def _start(body: Body, points: PointSet, x: NDArray, sigma: NDArray) -> tuple[int, BodyState]:

@@ -45,6 +45,11 @@ class SequenceFit:
     costs: NDArray
     iterations: NDArray
 
+    @property
+    def last(self) -> BodyState:
+        """The state of the last frame."""
+        return BodyState(self.Ts_world_root[-1], self.angles[-1])
+
 
 def fit_sequence(
     body: Body,

@@ -18,12 +18,9 @@ from kinefit.markers.poses import sequence_both_ways
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.sensors.settings import TrackSettings
+from kinefit.smoothing.sensor_noise import covariance_alone, marker_matrices
 from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.smoothing.unwrap import unwrap
-from kinefit.solvers.equations import inverse
-from kinefit.solvers.sequence import fit_sequence
-from kinefit.solvers.trajectory.seen_points import SeenPoints
-from kinefit.solvers.trajectory.smoothing import unpacked
 from kinefit.subject.subject import Progress
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import TrackedSteps, tracker_of
@@ -65,7 +62,7 @@ def fit_marker_steps(
     for some in stretches(len(times), _SEQUENCE_FRAMES):
         part = markers.part(some)
         try:
-            roots[some], angles[some] = _refit_outliers(body, part, *_poses_after(last, body, part))
+            roots[some], angles[some] = _refit_outliers(body, part, *_poses(body, part, last))
         except TrackingError:
             return None
         last = BodyState(roots[some][-1], angles[some][-1])
@@ -74,20 +71,17 @@ def fit_marker_steps(
             progress("frames", some.stop, len(times))
     angles[:] = unwrap(body.tree, angles)
     nothing = _OnDemand(len(times), lambda f: ())
-    results = _judged(body, markers, roots, angles) if judge else _poses(body, times, roots, angles)
+    results = _judged(body, markers, roots, angles) if judge else _blank(body, times, roots, angles)
     return TrackedSteps(
         results, nothing, nothing, times, recording.rate, tracker.scene_of, tracker.apart, list(range(len(times))),
         tracker, True, markers=markers,
     )  # fmt: skip
 
 
-def _poses_after(last: BodyState | None, body: Body, markers: PackedMarkers) -> tuple[NDArray, NDArray]:
+def _poses(body: Body, markers: PackedMarkers, start: BodyState | None = None) -> tuple[NDArray, NDArray]:
     """Roots (F, 4, 4) and angles (F, D) [rad], fitted from the state before the first frame; None: without one."""
     x, sigma = markers.measured
-    if last is None:
-        return sequence_both_ways(body, markers.points, x, sigma, loss=markers.loss)
-    fit = fit_sequence(body, last, markers.points, x, sigma=sigma, loss=markers.loss, posture=1.0)
-    return fit.Ts_world_root, fit.angles
+    return sequence_both_ways(body, markers.points, x, sigma, start=start, loss=markers.loss)
 
 
 def _misfit(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> NDArray:
@@ -97,17 +91,14 @@ def _misfit(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray)
     return np.where(seen, np.minimum(np.nan_to_num(off), 10.0), 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
 
 
-def _refit_outliers(
-    body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray
-) -> tuple[NDArray, NDArray]:
-    """Fit frames with an outlying misfit again without initial pose; keep the better fit."""
-    roots, angles = roots.copy(), angles.copy()
+def _refit_outliers(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
+    """Fit frames with an outlying misfit again without initial pose; the better fit replaces the other in place."""
     misfit = _misfit(body, markers, roots, angles)
     is_outlier = misfit > max(_OUTLIER_MISFIT_RATIO * float(np.median(misfit)), 3.0)
     for a, b in sorted(runs_of(is_outlier), key=lambda run: run[0] - run[1])[:_MAX_REFIT_RUNS]:
         part = markers.part(slice(a, b))
         try:
-            other_roots, other_angles = _poses_after(None, body, part)
+            other_roots, other_angles = _poses(body, part)
         except TrackingError:
             continue
         better = _misfit(body, part, other_roots, other_angles) < 0.9 * misfit[a:b]
@@ -117,19 +108,15 @@ def _refit_outliers(
 
 def _judged(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> Spool[FrameResult]:
     """Fitted poses (F, 4, 4), (F, D) as frames with the standard deviations of each frame on its own."""
-    tree, out = body.tree, Spool[FrameResult]()
-    prior = np.zeros((tree.n_dofs, tree.n_dofs))
-    prior[6:, 6:] = tree.posture_precision
-    prior[:6, :6] = np.eye(6)
+    out = Spool[FrameResult]()
     for some in stretches(len(roots), MATRIX_FRAMES):
         part, at = markers.part(some), (roots[some], angles[some])
-        points = SeenPoints.in_metres(part.points, part.places, part.weight, part.loss)
-        information = unpacked(points.equations(body)(*at)[0], tree) + prior
-        covariances = np.stack([inverse(H) for H in information])
-        observed = np.sqrt(np.einsum("fii->fi", covariances))[:, 6:] <= UNOBSERVED_STD_RATIO * tree.spread
+        states = (BodyState(root, q) for root, q in zip(*at))
+        covariances = np.stack([covariance_alone(body, *s) for s in zip(states, marker_matrices(body, part, *at))])
+        observed = np.sqrt(np.einsum("fii->fi", covariances))[:, 6:] <= UNOBSERVED_STD_RATIO * body.tree.spread
         for result in frame_results(
             body, *at, part.times, covariances, part.evidence(body, part.gaps(body, *at)), observed=observed,
-            iterations=np.zeros(len(covariances), int).tolist(),
+            iterations=[0] * len(covariances),
         ):
             out.append(result)
     return out
@@ -152,7 +139,7 @@ class _OnDemand(Sequence[Any]):
         return self._make(f)
 
 
-def _poses(body: Body, times: NDArray, roots: NDArray, angles: NDArray) -> _OnDemand:
+def _blank(body: Body, times: NDArray, roots: NDArray, angles: NDArray) -> _OnDemand:
     """Fitted poses (F, 4, 4), (F, D) at times (F,) [s] as frames without standard deviations."""
     some = BodyState(roots[0], angles[0])
     std, joints = np.full(body.tree.n_dofs, np.inf), np.full((len(body.tree.segments), 3), np.inf)

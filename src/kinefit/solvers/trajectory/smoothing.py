@@ -192,16 +192,22 @@ def responses(body: Body, smoothed: Smoothed, B: NDArray) -> NDArray:
 def _made_dense(body: Body, equations: MakeEquations) -> MakeEquations:
     def dense(roots: NDArray, angles: NDArray) -> Equations:
         packed, g, cost = equations(roots, angles)
-        return unpacked(packed, body.tree), g, cost
+        return _lower(packed, body.tree), g, cost
 
     return dense
 
 
 def unpacked(packed: NDArray, tree: KinematicTree) -> NDArray:
     """Symmetric (T, n, n) of matrices (T, n, m) that are packed along the tree."""
+    out = _lower(packed, tree)
+    return out + np.tril(out, -1).transpose(0, 2, 1)
+
+
+def _lower(packed: NDArray, tree: KinematicTree) -> NDArray:
+    """Lower triangles (T, n, n) of matrices (T, n, m) that are packed along the tree; 0 above."""
     out = np.zeros((*packed.shape[:2], tree.n_dofs))
     _kernels_smoothing.add_packed(packed, tree.chain, tree.depth, out)
-    return out + np.tril(out, -1).transpose(0, 2, 1)
+    return out
 
 
 def _workspace(T: int, n: int) -> tuple[NDArray, NDArray, NDArray]:
