@@ -83,7 +83,7 @@ def fit_markers(
         _SENSOR, replace(markers, names=points.names, positions=columns(markers, points.names), residual=None),
         placement.name,
     )  # fmt: skip
-    fitted = replace(body, marker_sets={placement.name: points} | body.marker_sets)
+    fitted = replace(body, marker_sets={placement.name: points, **body.marker_sets})
     fitted = fitted if limits else fitted.without_limits()
     recording = Recording(
         markers.times, markers.rate, Rig(()), steps=lambda i: [worn.at(float(markers.times[i]))], sigma=each,
