@@ -38,7 +38,7 @@ def tracked():
     take = as_tracked(truth.body, frames, TrackSettings())
     assert take.others is None
     rows = OtherSensors(
-        frames.times, frames.measurements, frames.scene_of, frames.apart, TrackSettings(), {"mocap": 1.0},
+        frames.times, frames.results, frames.scene_of, frames.apart, TrackSettings(), {"mocap": 1.0},
         np.zeros(len(truth)),
     )  # fmt: skip
     by_rows = replace(take, markers=None, others=rows)

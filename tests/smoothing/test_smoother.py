@@ -142,7 +142,7 @@ def followed(truth, rig, keypoints, sigma=8.0):
 
 def smoothed_of(truth, tracked, settings=DEFAULT, count=None, **options):
     """Smoothed frames, and what is told of them."""
-    frames = replace(tracked, results=tracked.results[:count], measurements=tracked.measurements[:count])
+    frames = replace(tracked, results=tracked.results[:count])
     done = smooth_results(truth.body, frames, settings, **options)
     return done.results, done.provenance
 

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure
 from kinefit.frame.fit import rows_of
-from kinefit.frame.results import evidence_of
+from kinefit.frame.results import FrameResult, evidence_of
 from kinefit.frame.trust import segments_not_shown
 from kinefit.rows import AnyRows, DofRows, Rows
-from kinefit.sensors.base import Matched, Measurement, matched_by
+from kinefit.sensors.base import Matched, matched_by
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.spool import Spool
@@ -77,7 +77,7 @@ class OtherSensors:
     Parameters
     ----------
     times : (T,) [s]
-    measurements : T lists
+    results : T kept frames
     scene_of : (state, time) -> scene
     apart : scene -> rows against collisions of the body with itself
     settings : TrackSettings
@@ -86,7 +86,7 @@ class OtherSensors:
     """
 
     times: NDArray
-    measurements: Sequence[tuple[Measurement, ...]]
+    results: Sequence[FrameResult]
     scene_of: SceneOf
     apart: ApartRows
     settings: TrackSettings
@@ -95,7 +95,7 @@ class OtherSensors:
 
     def part(self, frames: slice) -> OtherSensors:
         """The measurements of some frames."""
-        names = ("times", "measurements", "points")
+        names = ("times", "results", "points")
         return replace(self, **{name: getattr(self, name)[frames] for name in names})
 
     def scene(self, f: int, roots: NDArray, angles: NDArray) -> Scene:
@@ -106,7 +106,7 @@ class OtherSensors:
             step = BodyState(roots[a], angles[a]).difference(BodyState(roots[b], angles[b]))
             velocity = step / max(float(self.times[b] - self.times[a]), 1e-6)
         scene = self.scene_of(state, float(self.times[f]))
-        return scene.at(state, measurements=self.measurements[f], velocity=velocity)
+        return scene.at(state, measurements=self.results[f].measurements, velocity=velocity)
 
     def matched(self, scene: Scene) -> tuple[Matched, ...]:
         """The measurements of a frame, matched at its scene."""

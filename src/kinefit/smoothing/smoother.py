@@ -195,13 +195,13 @@ def as_tracked(body: Body, frames: TrackedFrames, settings: TrackSettings) -> Sm
     points = PointSet(names, channels.points.segments[channels.column], channels.points.points[channels.column])
     all_observed = np.ones((len(roots), len(body.tree.coordinates)), bool)
     uv, confidence = correct_swaps(channels, swapped)
-    markers, measurements = frames.packed_markers(body, settings)
-    sensors, others = dict.fromkeys((m.sensor for several in measurements for m in several), 1.0), None
+    markers, rest = frames.packed_markers(body, settings)
+    sensors, others = dict.fromkeys((m.sensor for r in rest for m in r.measurements), 1.0), None
     if sensors or body.closures:
         rows = 2 * np.count_nonzero(channels.weight, axis=1)
         rows += 0 if markers is None else 3 * np.count_nonzero(markers.stated, axis=1)
         others = OtherSensors(
-            frames.times, measurements, frames.scene_of, frames.apart, settings, sensors, rows
+            frames.times, rest, frames.scene_of, frames.apart, settings, sensors, rows
         )  # fmt: skip
     return SmoothTake(
         body, channels, points, without_bias(body, channels, uv, roots, angles), confidence, swapped, roots, angles,

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from kinefit._mapped import release, room
 from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
-from kinefit.sensors.base import Leftover, Measurement
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.points.keypoints import pixels_of
 from kinefit.sensors.points.packed_markers import PackedMarkers
@@ -27,9 +26,7 @@ class TrackedFrames:
 
     Parameters
     ----------
-    results : F frames, with only those matches that have packed `pixels`, all in one layout
-    measurements : F tuples, the measurements of all other sensors, without whole images
-    leftovers : F tuples, the residuals of every sensor
+    results : F kept frames, see `FrameResult.kept`; the matches of keypoints all in one layout
     times : (F,) [s]
     rate : float [Hz]
     scene_of, apart : of the tracker, see `lag_frame.TrackerLike`
@@ -37,8 +34,6 @@ class TrackedFrames:
     """
 
     results: Sequence[FrameResult]
-    measurements: Sequence[tuple[Measurement, ...]]
-    leftovers: Sequence[tuple[Leftover, ...]]
     times: NDArray
     rate: float
     scene_of: SceneOf
@@ -67,23 +62,22 @@ class TrackedFrames:
 
     def packed_markers(
         self, body: Body, settings: TrackSettings
-    ) -> tuple[PackedMarkers | None, Sequence[tuple[Measurement, ...]]]:
-        """Labelled markers of all frames as one block, and the measurements of all other sensors.
+    ) -> tuple[PackedMarkers | None, Sequence[FrameResult]]:
+        """Labelled markers of all frames as one block, and the frames with the measurements of all other sensors.
 
         Joints that move with morphs need rows: there are then no packed markers.
         """
-        if self.markers is not None:
-            return self.markers, ()
-        markers = None
+        markers = self.markers
+        if markers is not None:
+            return markers, self.results
         if len(self.results) and self.scene_of(self.results[0].state, 0.0).morphing is None:
-            markers = PackedMarkers.of(body, self.measurements, self.times, settings.marker_loss)
+            measured = (r.measurements for r in self.results)
+            markers = PackedMarkers.of(body, measured, self.times, settings.marker_loss)
         if markers is None:
-            return None, self.measurements
+            return None, self.results
         packed = set(markers.sensors)
-        rest = Spool[tuple[Measurement, ...]]()
-        for several in self.measurements:
-            rest.append(tuple(m for m in several if m.sensor not in packed))
-        return markers, rest
+        rest = (tuple(m for m in r.measurements if m.sensor not in packed) for r in self.results)
+        return markers, Spool(replace(r, measurements=m) for r, m in zip(self.results, rest))
 
 
 def correct_swaps(channels: Channels, swapped: NDArray) -> tuple[NDArray, NDArray]:

@@ -73,11 +73,10 @@ def fit_marker_steps(
         if progress:
             progress("frames", some.stop, len(times))
     angles[:] = unwrap(body.tree, angles)
-    nothing = _OnDemand(len(times), lambda f: ())
     results = _judged(body, markers, roots, angles) if judge else _poses(body, times, roots, angles)
     return TrackedSteps(
-        results, nothing, nothing, times, recording.rate, tracker.scene_of, tracker.apart, list(range(len(times))),
-        tracker, True, markers=markers,
+        results, times, recording.rate, tracker.scene_of, tracker.apart, list(range(len(times))), tracker, True,
+        markers=markers,
     )  # fmt: skip
 
 

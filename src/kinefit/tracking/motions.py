@@ -117,7 +117,7 @@ def motion_of(
     residuals = {} if markers is None else markers.residuals(body, take.roots, take.angles)
     if markers is None or channels.sources or (others is not None and others.scale):
         again = seen if smooth or lag is not None else None
-        residuals = _residuals(len(results), again, frames.leftovers, packed) | residuals
+        residuals = _residuals(frames.results, again, packed) | residuals
     release(channels.uv, channels.confidence, take.uv, take.confidence, weight)
     stated = {name: float(np.median(channels.sigma[channels.source == q])) for q, name in enumerate(channels.sources)}
     provenance["contradictions"] |= cameras_apart(residuals, stated)
@@ -176,39 +176,37 @@ def _arrays(results: Iterable[FrameResult], body: Body, frames: int) -> dict[str
 
 def _behind(
     frames: TrackedFrames, body: Body, settings: TrackSettings, lag: float, noise: KnownNoise | None
-) -> tuple[list[FrameResult], Spool[tuple[Matched, ...]], dict[str, Any]]:
+) -> tuple[Spool[FrameResult], Spool[tuple[Matched, ...]], dict[str, Any]]:
     """All frames as a live session has them a lag [s] behind, with angles that go on; and what there is to tell.
 
     Beside the results, which have the matches of keypoints alone, those of all other sensors.
     """
     behind = FixedLag(TrackerView(body, frames.rate, settings, frames.scene_of, frames.apart), lag, noise=noise)
-    out: list[FrameResult] = []
-    matched = Spool[tuple[Matched, ...]]()
+    out, matched = Spool[FrameResult](), Spool[tuple[Matched, ...]]()
 
     def take(late: list[FrameResult]) -> None:
         for r in late:
             matched.append(tuple(m for m in r.matched if not isinstance(m, KeypointMatched)))
-            out.append(replace(r, matched=tuple(pixels_of(r.matched)), measurements=()))
+            out.append(replace(r, matched=tuple(pixels_of(r.matched))))
 
-    for result, measurements in zip(frames.results, frames.measurements):
-        take(behind.add(result, measurements, ahead=1))
+    for result in frames.results:
+        take(behind.add(result, result.measurements, ahead=1))
     take(behind.finish())
     angles = unwrap(body.tree, np.stack([r.state.angles for r in out]))
-    out = [replace(r, state=BodyState(r.state.T_world_root, q)) for r, q in zip(out, angles)]
-    return out, matched, {"seconds": round(behind.seconds, 4), **behind.noise.as_record(body)}
+    late = Spool(replace(r, state=BodyState(r.state.T_world_root, q)) for r, q in zip(out, angles))
+    return late, matched, {"seconds": round(behind.seconds, 4), **behind.noise.as_record(body)}
 
 
 def _residuals(
-    count: int, seen: Callable[[int], tuple[Scene, list[Matched]]] | None, tracked: Sequence[tuple[Leftover, ...]],
-    without: Collection[str] = (),
-) -> dict[str, Residuals]:  # fmt: skip
-    """Residuals of so many frames, of all sensors but some: as they were tracked, or of what was matched since."""
-    remains = Remains(count)
-    for f in range(count):
+    tracked: Sequence[FrameResult], seen: Callable[[int], tuple[Scene, list[Matched]]] | None, without: Collection[str]
+) -> dict[str, Residuals]:
+    """Residuals of all sensors but some: as the frames were tracked, or of what was matched since."""
+    remains = Remains(len(tracked))
+    for f in range(len(tracked)):
         if f % STRETCH == 0:
             remains.release()
         if seen is None:
-            remains.add(f, (rest for rest in tracked[f] if rest.label not in without))
+            remains.add(f, (rest for rest in tracked[f].leftovers if rest.label not in without))
             continue
         scene, matched = seen(f)
         remains.add(f, (rest for m in matched for rest in leftovers_at(m, scene)))
