@@ -142,8 +142,8 @@ def followed(truth, rig, keypoints, sigma=8.0):
 
 def smoothed_of(truth, tracked, settings=DEFAULT, count=None, **options):
     """Smoothed frames, and what is told of them."""
-    frames = replace(tracked, results=tracked.results[:count])
-    done = smooth_results(truth.body, frames, settings, **options)
+    frames = replace(tracked, results=tracked.results[:count], settings=settings)
+    done = smooth_results(frames, **options)
     return done.results, done.provenance
 
 

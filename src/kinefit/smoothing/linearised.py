@@ -1,34 +1,18 @@
-"""Linearise any sensors over a whole take: matched once a round, and a quadratic cost of the poses within the round.
-
-Near the states where a frame's rows were made, the cost of its measurements is c − 2 gᵀδ + δᵀHδ. So a round costs one
-match and one linearisation of each frame, whatever the sensors. The motion prior and the keypoints are not
-approximated: the solver evaluates them at every step.
-"""
+"""Quadratic costs of the poses of a take, from sensors that are matched once a round."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState
-from kinefit.correspondences.closures import every_closure
-from kinefit.frame.fit import rows_of
-from kinefit.frame.results import FrameResult, evidence_of
-from kinefit.frame.trust import segments_not_shown
+from kinefit.bodies import Body
 from kinefit.rows import AnyRows, DofRows, Rows
-from kinefit.sensors.base import Matched, matched_by
-from kinefit.sensors.scene import Scene
-from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.spool import Spool
-from kinefit.solvers.equations import normal_equations
+from kinefit.sensors.base import Matched
 from kinefit.solvers.trajectory import _kernels_smoothing
 from kinefit.solvers.trajectory.smoothing import Equations, MakeEquations
-
-SceneOf = Callable[[BodyState, float], Scene]
-ApartRows = Callable[[Scene], Sequence[AnyRows]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,119 +52,6 @@ class Linearised:
         if self.unsupported is not None and later.unsupported is not None:
             unsupported = np.concatenate([self.unsupported, later.unsupported])
         return replace(self, **both, matched=(), unsupported=unsupported)
-
-
-@dataclass(frozen=True, eq=False)
-class OtherSensors:
-    """Measurements of all sensors but the keypoints in T frames.
-
-    Parameters
-    ----------
-    times : (T,) [s]
-    results : T kept frames
-    scene_of : (state, time) -> scene
-    apart : scene -> rows against collisions of the body with itself
-    settings : TrackSettings
-    scale : {sensor: factor on its standard deviation}, estimated from the take; 1 for other sensors
-    points : (T,) int, number of rows of keypoints in every frame
-    """
-
-    times: NDArray
-    results: Sequence[FrameResult]
-    scene_of: SceneOf
-    apart: ApartRows
-    settings: TrackSettings
-    scale: dict[str, float]
-    points: NDArray
-
-    def part(self, frames: slice) -> OtherSensors:
-        """The measurements of some frames."""
-        names = ("times", "results", "points")
-        return replace(self, **{name: getattr(self, name)[frames] for name in names})
-
-    def scene(self, f: int, roots: NDArray, angles: NDArray) -> Scene:
-        """The scene of one frame at states (T, 4, 4), (T, D), with their velocity there."""
-        state, (a, b) = BodyState(roots[f], angles[f]), (max(f - 1, 0), min(f + 1, len(roots) - 1))
-        velocity = None
-        if b > a:
-            step = BodyState(roots[a], angles[a]).difference(BodyState(roots[b], angles[b]))
-            velocity = step / max(float(self.times[b] - self.times[a]), 1e-6)
-        scene = self.scene_of(state, float(self.times[f]))
-        return scene.at(state, measurements=self.results[f].measurements, velocity=velocity)
-
-    def matched(self, scene: Scene) -> tuple[Matched, ...]:
-        """The measurements of a frame, matched at its scene."""
-        return tuple(matched_by(m, scene, self.settings.near) for m in scene.measurements)
-
-    def linearised(
-        self, body: Body, roots: NDArray, angles: NDArray, *, frames: range | None = None,
-        keep: Spool[tuple[Matched, ...]] | None = None, judge: bool = False,
-    ) -> Linearised:  # fmt: skip
-        """Match and linearise frames at states (T, 4, 4), (T, D).
-
-        Parameters
-        ----------
-        frames : numbers of the frames; default: all
-        keep : spool to which their matches are appended
-        judge : whether `Linearised.unsupported` is computed
-        """
-        chosen = range(len(roots)) if frames is None else frames
-        F, n = len(chosen), body.tree.n_dofs
-        H, g, cost, rows = np.zeros((F, n, n)), np.zeros((F, n)), np.zeros(F), np.zeros(F)
-        unsupported = np.zeros((F, n, n)) if judge else None
-        for k, f in enumerate(chosen):
-            scene = self.scene(f, roots, angles)
-            matched = self.matched(scene)
-            if keep is not None:
-                keep.append(matched)
-            parts = rows_of(scene, matched, self.settings, self.scale, points=int(self.points[f]))
-            rows[k] = sum(int(np.sum(squares_of(r)[1] > 0.25)) for r in parts)
-            if matched:
-                parts += self.apart(scene)
-            parts += every_closure(body, scene.state)
-            if parts:
-                equations = normal_equations(body, scene.state, parts)
-                H[k], g[k], cost[k] = equations.matrix, equations.gradient, equations.cost
-            if unsupported is None or not any(m.shows_surface for m in matched):
-                continue
-            without = [segments_not_shown(m, e) for m, e in zip(matched, evidence_of(scene, matched))]
-            if any(w is not None and w.any() for w in without):
-                points = int(self.points[f])
-                supported = rows_of(scene, matched, self.settings, self.scale, points=points, without=without)
-                unsupported[k] = H[k] - normal_equations(body, scene.state, supported).matrix
-        span = slice(chosen.start, chosen.stop)
-        return Linearised(H, g, cost, np.array(roots[span]), np.array(angles[span]), keep or (), rows, unsupported)
-
-    def windows(
-        self, body: Body, roots: NDArray, angles: NDArray, spans: Sequence[slice],
-        keep: Spool[tuple[Matched, ...]] | None = None, *, judge: bool = False,
-    ) -> Iterator[Linearised]:  # fmt: skip
-        """Linearise overlapping windows one after the other; frames that two of them share are linearised once.
-
-        Parameters
-        ----------
-        roots, angles : (T, 4, 4), (T, D)
-        spans : slices of the windows
-        keep : spool to which the matches of all frames are appended, each once
-        judge : see `linearised`
-        """
-        last, first, done = None, 0, 0
-        for span in spans:
-            new = self.linearised(body, roots, angles, frames=range(done, span.stop), keep=keep, judge=judge)
-            last = new if last is None else last.part(slice(span.start - first, None)).followed_by(new)
-            first, done = span.start, span.stop
-            yield last
-
-
-def with_values(others: OtherSensors, values: Mapping[str, Mapping[str, float]]) -> OtherSensors:
-    """The same measurements with other estimates of their sensors' own unknowns."""
-    scene_of = others.scene_of
-
-    def valued(state: BodyState, time: float) -> Scene:
-        scene = scene_of(state, time)
-        return scene.at(scene.state, values={**scene.values, **values})
-
-    return replace(others, scene_of=valued)
 
 
 def with_quadratic(body: Body, make: MakeEquations, more: Linearised) -> MakeEquations:

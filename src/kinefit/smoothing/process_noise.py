@@ -17,9 +17,10 @@ from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import Channels, joined
 from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.smoothing.foot_contacts import Contacts
-from kinefit.smoothing.linearised import Linearised, OtherSensors, squares_of, with_quadratic
+from kinefit.smoothing.linearised import Linearised, squares_of, with_quadratic
 from kinefit.smoothing.shared_errors import SharedErrors, shared_by
 from kinefit.smoothing.spool import Spool, stretches
+from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.smoothing.unwrap import boxes
 from kinefit.solvers.trajectory.motion_prior import MotionPrior
 from kinefit.solvers.trajectory.seen_points import SeenPoints
@@ -66,7 +67,7 @@ class SmoothTake:
 
     `uv` (T, N, 2) [px], `confidence` (T, N); `swapped` (T, N) bool: channels whose sides were exchanged;
     `observed` (T, D) bool: coordinates that a frame nearby observes on its own; `live` (T, n): liveliness, a factor on
-    the process noise; `markers`: labelled markers; `others`: measurements of all other sensors, `linear` their costs at
+    the process noise; `markers`: labelled markers; `others`: frames of all other sensors, `linear` their costs at
     the states;
     `speed_std` (n,) [m/s, rad/s]: 90th percentile over frames; `one_view`: one camera is the only sensor, so no other
     view contradicts the errors of its keypoints.
@@ -87,7 +88,7 @@ class SmoothTake:
     memory: tuple[float, float]
     contacts: Contacts | None = None
     markers: PackedMarkers | None = None
-    others: OtherSensors | None = None
+    others: TrackedFrames | None = None
     linear: Linearised | None = None
     speed_std: NDArray | None = None
     one_view: bool = False
@@ -97,7 +98,7 @@ class SmoothTake:
         if self.others is None:
             return self
         matches = Spool[tuple[Matched, ...]]() if keep else None
-        return replace(self, linear=self.others.linearised(self.body, self.roots, self.angles, keep=matches))
+        return replace(self, linear=self.others.linearised(self.roots, self.angles, keep=matches))
 
     def part(self, frames: slice) -> SmoothTake:
         """Some frames of the take."""

@@ -21,9 +21,10 @@ from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import ChannelResiduals
 from kinefit.sensors.points.markers import MarkerMatched
 from kinefit.sensors.points.packed_markers import PackedMarkers
-from kinefit.smoothing.linearised import OtherSensors, squares_of
+from kinefit.smoothing.linearised import squares_of
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
+from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.solvers.bundle.border_frames import gram
 from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, point_derivatives, product
 from kinefit.solvers.trajectory.seen_points import SeenPoints
@@ -104,7 +105,7 @@ def leverages(J: NDArray, pushed: NDArray, alone: NDArray) -> NDArray:
 
 
 def other_noise(
-    body: Body, others: OtherSensors, matched: Sequence[tuple[Matched, ...]], roots: NDArray, angles: NDArray,
+    body: Body, others: TrackedFrames, matched: Sequence[tuple[Matched, ...]], roots: NDArray, angles: NDArray,
     pixels: Callable[[int], NDArray], *, half: int = 0, surfaces: bool = True,
 ) -> OtherNoise:  # fmt: skip
     """Estimate the noise of all sensors but the keypoints from their residuals at fitted states.

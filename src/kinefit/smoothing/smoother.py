@@ -24,7 +24,6 @@ from kinefit.sensors.points.views import find_swaps, limb_groups
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.border import Border, with_border
 from kinefit.smoothing.foot_contacts import find_contacts
-from kinefit.smoothing.linearised import OtherSensors
 from kinefit.smoothing.process_noise import MIN_INLIER_FACTOR, SmoothTake, Strength, estimate, estimate_liveliness
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
@@ -66,7 +65,7 @@ class SmoothedTake:
 
 
 def smooth_results(
-    body: Body, frames: TrackedFrames, settings: TrackSettings, *, contacts: bool = False, up: str = "z",
+    frames: TrackedFrames, *, contacts: bool = False, up: str = "z",
     eye: NDArray | None = None, level: bool = True, windows: tuple[int, int] = (300, 60), border: Border | None = None,
 ) -> SmoothedTake:  # fmt: skip
     """Smooth tracked frames of any sensors jointly.
@@ -84,7 +83,8 @@ def smooth_results(
     windows : number of frames that are solved at a time, and that two neighbouring windows share
     border : the sensors' own unknowns, to start from
     """
-    take = replace(_take(as_tracked(body, frames, settings), settings), one_view=eye is not None)
+    body, settings = frames.body, frames.settings
+    take = replace(_take(as_tracked(frames), settings), one_view=eye is not None)
     channels, swapped = take.channels, take.swapped
     strength, take, rounds = _estimate(take, settings, *windows)
     if border is not None and take.others is not None:
@@ -187,22 +187,21 @@ def _with_unknown_joints(body: Body, results: Sequence[FrameResult], half: int) 
     )  # fmt: skip
 
 
-def as_tracked(body: Body, frames: TrackedFrames, settings: TrackSettings) -> SmoothTake:
+def as_tracked(frames: TrackedFrames) -> SmoothTake:
     """Measurements of tracked frames with the tracker's swaps and states, not smoothed."""
-    (channels, swapped), results = frames.pixels(), frames.results
+    (channels, swapped), results, body, settings = frames.pixels(), frames.results, frames.body, frames.settings
     roots, angles = map(np.stack, zip(*((r.state.T_world_root, r.state.angles) for r in results)))
     names = tuple(channels.points.names[c] for c in channels.column)
     points = PointSet(names, channels.points.segments[channels.column], channels.points.points[channels.column])
     all_observed = np.ones((len(roots), len(body.tree.coordinates)), bool)
     uv, confidence = correct_swaps(channels, swapped)
-    markers, rest = frames.packed_markers(body, settings)
-    sensors, others = dict.fromkeys((m.sensor for r in rest for m in r.measurements), 1.0), None
+    markers, others = frames.packed_markers(), None
+    packed = () if markers is None else markers.sensors
+    sensors = dict.fromkeys((m.sensor for r in results for m in r.measurements if m.sensor not in packed), 1.0)
     if sensors or body.closures:
         rows = 2 * np.count_nonzero(channels.weight, axis=1)
         rows += 0 if markers is None else 3 * np.count_nonzero(markers.stated, axis=1)
-        others = OtherSensors(
-            frames.times, rest, frames.scene_of, frames.apart, settings, sensors, rows
-        )  # fmt: skip
+        others = replace(frames, packed=packed, points=rows, scale=sensors)
     return SmoothTake(
         body, channels, points, without_bias(body, channels, uv, roots, angles), confidence, swapped, roots, angles,
         all_observed, np.ones((len(roots), body.tree.n_dofs)), 1.0 / frames.rate, settings.loss,
@@ -239,7 +238,7 @@ def _observed(take: SmoothTake) -> tuple[list[NDArray], NDArray]:
             gaps = part.markers.gaps(part.body, part.roots, part.angles)
             rows[some] += 3 * np.count_nonzero(part.markers.factors(gaps) > MIN_INLIER_FACTOR, axis=1)
         if take.others is not None:
-            linear = take.others.linearised(take.body, take.roots, take.angles, frames=range(some.start, some.stop))
+            linear = take.others.linearised(take.roots, take.angles, frames=range(some.start, some.stop))
             found, rows[some] = [H + linear.H for H in found], rows[some] + linear.rows
         for observed, matrices in zip(out, found):
             variance = np.array([variances(H + prior)[6:] for H in matrices])

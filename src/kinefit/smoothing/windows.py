@@ -95,7 +95,7 @@ def linear_parts(
     """Windows of a take, with other sensors matched and linearised at its states; matches are added to `matched`."""
     spans, linear = [whole for whole, _ in windows], None
     if take.others is not None:
-        linear = take.others.windows(take.body, take.roots, take.angles, spans, matched, judge=judge)
+        linear = take.others.windows(take.roots, take.angles, spans, matched, judge=judge)
     for whole in spans:
         part = take.part(whole)
         yield part if linear is None else replace(part, linear=next(linear))

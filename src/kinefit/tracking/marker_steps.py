@@ -75,8 +75,8 @@ def fit_marker_steps(
     angles[:] = unwrap(body.tree, angles)
     results = _judged(body, markers, roots, angles) if judge else _poses(body, times, roots, angles)
     return TrackedSteps(
-        results, times, recording.rate, tracker.scene_of, tracker.apart, list(range(len(times))), tracker, True,
-        markers=markers,
+        results, times, body, recording.rate, settings, tracker.scene_of, tracker.apart, list(range(len(times))),
+        tracker, True, markers=markers,
     )  # fmt: skip
 
 

@@ -18,10 +18,9 @@ from kinefit.motion import Motion, Residuals
 from kinefit.sensors.base import Leftover, Matched, leftovers_at
 from kinefit.sensors.points.keypoints import KeypointMatched, pixels_of
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.border import Border
 from kinefit.smoothing.online.fixed_lag import FixedLag
-from kinefit.smoothing.online.lag_frame import KnownNoise, TrackerView
+from kinefit.smoothing.online.lag_frame import KnownNoise
 from kinefit.smoothing.sensor_noise import noise_of_sensors
 from kinefit.smoothing.shape_errors import shape_errors
 from kinefit.smoothing.smoother import as_tracked, smooth_results
@@ -57,7 +56,7 @@ class Estimation:
 
 
 def motion_of(
-    frames: TrackedFrames, subject: Subject, settings: TrackSettings, how: Estimation, *, up: str = "z",
+    frames: TrackedFrames, subject: Subject, how: Estimation, *, up: str = "z",
     name: str = "motion", more: Mapping[str, Any] | None = None, found: Sequence[SubjectFit] = (),
 ) -> Motion:  # fmt: skip
     """The motion of what was tracked.
@@ -66,12 +65,11 @@ def motion_of(
     ----------
     frames : TrackedFrames
     subject : Subject, with the body; its lengths are taken for exact where it does not tell how sure they are.
-    settings : TrackSettings
     up, name : of the motion
     more : further entries of `Motion.provenance`
     found : what all sensors were fitted with together, with its covariance
     """
-    body, rate, results = subject.body, frames.rate, frames.results
+    body, settings, rate, results = frames.body, frames.settings, frames.rate, frames.results
     smooth, lag, eye = how.smooth, how.lag, how.eye
     provenance: dict[str, Any] = dict(more or {})
     shared = None
@@ -80,7 +78,7 @@ def motion_of(
         held = how.contacts or eye is not None or not how.level
         border = next(filter(None, map(Border.of, found)), None)
         done = smooth_results(
-            body, frames, settings, contacts=held, up=up, eye=eye, level=how.level, border=border
+            frames, contacts=held, up=up, eye=eye, level=how.level, border=border
         )
         results, take, weight, shared = done.results, done.take, done.weight, done.shared
         provenance["smoothing"] = done.provenance
@@ -90,8 +88,8 @@ def motion_of(
             provenance["shape"] = dict(item for one in found for item in one.record().items())
     else:
         if lag is not None:
-            results, matched, provenance["fixed lag"] = _behind(frames, body, settings, lag, how.noise)
-        take = as_tracked(body, replace(frames, results=results), settings)
+            results, matched, provenance["fixed lag"] = _behind(frames, lag, how.noise)
+        take = as_tracked(replace(frames, results=results))
         sigma = take.channels.sigma
         weight = take.confidence / np.square(sigma) * take.factors(sigma, take.fitted(take.roots, take.angles))
         if take.others is not None and lag is None:
@@ -175,13 +173,13 @@ def _arrays(results: Iterable[FrameResult], body: Body, frames: int) -> dict[str
 
 
 def _behind(
-    frames: TrackedFrames, body: Body, settings: TrackSettings, lag: float, noise: KnownNoise | None
+    frames: TrackedFrames, lag: float, noise: KnownNoise | None
 ) -> tuple[Spool[FrameResult], Spool[tuple[Matched, ...]], dict[str, Any]]:
     """All frames as a live session has them a lag [s] behind, with angles that go on; and what there is to tell.
 
     Beside the results, which have the matches of keypoints alone, those of all other sensors.
     """
-    behind = FixedLag(TrackerView(body, frames.rate, settings, frames.scene_of, frames.apart), lag, noise=noise)
+    behind, body = FixedLag(frames, lag, noise=noise), frames.body
     out, matched = Spool[FrameResult](), Spool[tuple[Matched, ...]]()
 
     def take(late: list[FrameResult]) -> None:

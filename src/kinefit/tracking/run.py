@@ -87,8 +87,8 @@ class _Frames:
         done = sorted(self.place)
         order = [self.place[i] for i in done]
         return TrackedSteps(
-            self.results.chosen(order), recording.times[done], recording.rate, tracker.scene_of, tracker.apart, done,
-            tracker, not stopped and len(done) == len(recording),
+            self.results.chosen(order), recording.times[done], tracker.body, recording.rate, tracker.settings,
+            tracker.scene_of, tracker.apart, done, tracker, not stopped and len(done) == len(recording),
         )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from kinefit.motion import UP_AXES
 from kinefit.observations.arrays import numbers
 from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement, Layout, pixels_of
 from kinefit.sensors.scene import Scene
-from kinefit.smoothing.linearised import ApartRows, SceneOf
+from kinefit.smoothing.online.lag_frame import TrackerLike
 from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.tracked_frames import TrackedFrames
 
@@ -63,10 +63,11 @@ class Session:
                 self._append(unseen(last, last.time + gap * k / ahead))
             self._append(new)
 
-    def frames(self, body: Body, scene_of: SceneOf, apart: ApartRows) -> TrackedFrames:
+    def frames(self, tracker: TrackerLike) -> TrackedFrames:
         """All of them, with the keypoints of whatever cameras in one layout."""
-        results = in_one_layout(body, self._results[:])
-        return TrackedFrames(results, np.array([r.time for r in results]), self.rate, scene_of, apart)
+        t, results = tracker, in_one_layout(tracker.body, self._results[:])
+        times = np.array([r.time for r in results])
+        return TrackedFrames(results, times, t.body, self.rate, t.settings, t.scene_of, t.apart)
 
 
 def unseen(last: FrameResult, time: float) -> FrameResult:

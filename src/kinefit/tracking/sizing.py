@@ -327,8 +327,9 @@ def _fitted_at(
         scene = tracker.scene_of(found.state, found.time).at(found.state, measurements=found.measurements)
         frames.append(found.kept(scene))
     return TrackedSteps(
-        frames, times[sorted(poses)], recording.rate, tracker.scene_of, tracker.apart, sorted(poses), tracker, False
-    )
+        frames, times[sorted(poses)], body, recording.rate, settings, tracker.scene_of, tracker.apart, sorted(poses),
+        tracker, False,
+    )  # fmt: skip
 
 
 def _by_joint(person: SizedPerson, found: SubjectFit) -> SizedPerson:

@@ -21,8 +21,8 @@ from kinefit.sensors.evidence import moves_points
 from kinefit.sensors.points.keypoints import KeypointMatched, pixels_of
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.linearised import ApartRows, SceneOf
 from kinefit.smoothing.process_noise import MIN_INLIER_FACTOR
+from kinefit.smoothing.tracked_frames import ApartRows, SceneOf
 from kinefit.solvers.equations import inverse, normal_equations
 
 
@@ -48,17 +48,6 @@ class TrackerLike(Protocol):
     @property
     def apart(self) -> ApartRows:
         """Scene -> rows against collisions of the body with itself."""
-
-
-@dataclass(frozen=True, eq=False)
-class TrackerView:
-    """The same attributes of a tracker that has finished."""
-
-    body: Body
-    rate: float
-    settings: TrackSettings
-    scene_of: SceneOf
-    apart: ApartRows
 
 
 @dataclass(eq=False)
