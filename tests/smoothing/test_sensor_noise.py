@@ -17,8 +17,8 @@ from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import squat_and_wave
 from kinefit.smoothing import sensor_noise
-from kinefit.smoothing.linearised import squares_of
 from kinefit.smoothing.smoother import as_tracked
+from kinefit.smoothing.tracked_frames import squares_of
 from kinefit.solvers.equations import block_diagonal, design, normal_equations
 from kinefit.tracking.run import run
 

@@ -74,10 +74,7 @@ def fit_marker_steps(
             progress("frames", some.stop, len(times))
     angles[:] = unwrap(body.tree, angles)
     results = _judged(body, markers, roots, angles) if judge else _poses(body, times, roots, angles)
-    return TrackedSteps(
-        results, times, body, recording.rate, settings, tracker.scene_of, tracker.apart, list(range(len(times))),
-        tracker, True, markers=markers,
-    )  # fmt: skip
+    return TrackedSteps(results, times, tracker, list(range(len(times))), True, markers=markers)
 
 
 def _poses_after(last: BodyState | None, body: Body, markers: PackedMarkers) -> tuple[NDArray, NDArray]:

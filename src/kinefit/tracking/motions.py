@@ -69,7 +69,8 @@ def motion_of(
     more : further entries of `Motion.provenance`
     found : what all sensors were fitted with together, with its covariance
     """
-    body, settings, rate, results = frames.body, frames.settings, frames.rate, frames.results
+    tracker, results = frames.tracker, frames.results
+    body, settings, rate = tracker.body, tracker.settings, tracker.rate
     smooth, lag, eye = how.smooth, how.lag, how.eye
     provenance: dict[str, Any] = dict(more or {})
     shared = None
@@ -90,8 +91,7 @@ def motion_of(
         if lag is not None:
             results, matched, provenance["fixed lag"] = _behind(frames, lag, how.noise)
         take = as_tracked(replace(frames, results=results))
-        sigma = take.channels.sigma
-        weight = take.confidence / np.square(sigma) * take.factors(sigma, take.fitted(take.roots, take.angles))
+        weight = take.pixels.weights(body, take.roots, take.angles, take.channels.sigma)
         if take.others is not None and lag is None:
             of = take.others
             matched = Spool(of.matched(of.scene(f, take.roots, take.angles)) for f in range(len(results)))
@@ -103,7 +103,7 @@ def motion_of(
     def seen(f: int) -> tuple[Scene, list[Matched]]:
         """A frame's scene, with the body where it is when each sensor measured, and all that was matched in it."""
         r = results[f]
-        scene = frames.scene_of(r.state, r.time) if others is None else others.scene(f, take.roots, take.angles)
+        scene = tracker.scene_of(r.state, r.time) if others is None else others.scene(f, take.roots, take.angles)
         return scene, [*r.matched, *(() if matched is None else matched[f])]
 
     def with_markers(f: int) -> tuple[Scene, list[Matched]]:
@@ -116,7 +116,8 @@ def motion_of(
     if markers is None or channels.sources or (others is not None and others.scale):
         again = seen if smooth or lag is not None else None
         residuals = _residuals(frames.results, again, packed) | residuals
-    release(channels.uv, channels.confidence, take.uv, take.confidence, weight)
+    take.pixels.release()
+    release(weight)
     stated = {name: float(np.median(channels.sigma[channels.source == q])) for q, name in enumerate(channels.sources)}
     provenance["contradictions"] |= cameras_apart(residuals, stated)
     # the tracker's own frames hold the surfaces' errors already
@@ -179,7 +180,7 @@ def _behind(
 
     Beside the results, which have the matches of keypoints alone, those of all other sensors.
     """
-    behind, body = FixedLag(frames, lag, noise=noise), frames.body
+    behind, body = FixedLag(frames.tracker, lag, noise=noise), frames.tracker.body
     out, matched = Spool[FrameResult](), Spool[tuple[Matched, ...]]()
 
     def take(late: list[FrameResult]) -> None:

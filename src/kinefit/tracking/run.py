@@ -38,12 +38,11 @@ class TrackedSteps(TrackedFrames):
     Parameters
     ----------
     steps : numbers of the steps that were done, in order
-    tracker : that did it
     complete : whether all steps were done
     """
 
-    steps: list[int]
     tracker: Tracker
+    steps: list[int]
     complete: bool
 
 
@@ -87,8 +86,8 @@ class _Frames:
         done = sorted(self.place)
         order = [self.place[i] for i in done]
         return TrackedSteps(
-            self.results.chosen(order), recording.times[done], tracker.body, recording.rate, tracker.settings,
-            tracker.scene_of, tracker.apart, done, tracker, not stopped and len(done) == len(recording),
+            self.results.chosen(order), recording.times[done], tracker, done,
+            not stopped and len(done) == len(recording),
         )  # fmt: skip
 
 

@@ -16,9 +16,8 @@ from kinefit.motion import UP_AXES
 from kinefit.observations.arrays import numbers
 from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement, Layout, pixels_of
 from kinefit.sensors.scene import Scene
-from kinefit.smoothing.online.lag_frame import TrackerLike
 from kinefit.smoothing.spool import Spool
-from kinefit.smoothing.tracked_frames import TrackedFrames
+from kinefit.smoothing.tracked_frames import TrackedFrames, TrackerLike
 
 
 class Session:
@@ -65,9 +64,8 @@ class Session:
 
     def frames(self, tracker: TrackerLike) -> TrackedFrames:
         """All of them, with the keypoints of whatever cameras in one layout."""
-        t, results = tracker, in_one_layout(tracker.body, self._results[:])
-        times = np.array([r.time for r in results])
-        return TrackedFrames(results, times, t.body, self.rate, t.settings, t.scene_of, t.apart)
+        results = in_one_layout(tracker.body, self._results[:])
+        return TrackedFrames(results, np.array([r.time for r in results]), tracker)
 
 
 def unseen(last: FrameResult, time: float) -> FrameResult:

@@ -326,10 +326,7 @@ def _fitted_at(
         found = tracker.fitted(float(times[step]), recording.steps(step), poses[step]).result
         scene = tracker.scene_of(found.state, found.time).at(found.state, measurements=found.measurements)
         frames.append(found.kept(scene))
-    return TrackedSteps(
-        frames, times[sorted(poses)], body, recording.rate, settings, tracker.scene_of, tracker.apart, sorted(poses),
-        tracker, False,
-    )  # fmt: skip
+    return TrackedSteps(frames, times[sorted(poses)], tracker, sorted(poses), False)
 
 
 def _by_joint(person: SizedPerson, found: SubjectFit) -> SizedPerson:

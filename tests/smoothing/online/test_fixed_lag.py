@@ -57,7 +57,7 @@ def whole(tracker, results, noise):
     """The whole take, smoothed with the same noise: states and covariances."""
     kept = [r.kept(tracker.scene_of(r.state, r.time)) for r in results]
     times = np.array([r.time for r in results])
-    take = as_tracked(TrackedFrames(kept, times, BODY, RATE, STILL, tracker.scene_of, tracker.apart))
+    take = as_tracked(TrackedFrames(kept, times, tracker))
     channels = take.channels
     take = replace(take, angles=unwrap(BODY.tree, take.angles))
     for _ in range(3):
