@@ -16,6 +16,7 @@ from benchmarks.house_imports import PACKAGE, circles
 PARTS = {
     "house": "code lines, questions of type, parameters, rooms and class names of the package",
     "house_record": "commands, options, take keys, formats, findings and public names that are lost",
+    "house_roads": "functions and types that a measurement passes on its way to a Motion",
     "house_words": "private words, names of constants, docstrings of public functions",
 }
 ROOT = Path(__file__).resolve().parents[1]

@@ -17,8 +17,8 @@ from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import squat_and_wave
 from kinefit.smoothing import sensor_noise
-from kinefit.smoothing.linearised import OtherSensors, squares_of
 from kinefit.smoothing.smoother import as_tracked
+from kinefit.smoothing.tracked_frames import squares_of
 from kinefit.solvers.equations import block_diagonal, design, normal_equations
 from kinefit.tracking.run import run
 
@@ -35,12 +35,9 @@ def tracked():
     steps = [[MarkerFrame("mocap", i / 20.0, points.names, x[i], "HANIM_45")] for i in range(len(truth))]
     recording = Recording.of_frames(steps, Rig(()), rate=20.0)
     frames = run(recording, truth.body, TrackSettings(), start=(0, truth.state(0)))
-    take = as_tracked(truth.body, frames, TrackSettings())
+    take = as_tracked(frames)
     assert take.others is None
-    rows = OtherSensors(
-        frames.times, frames.measurements, frames.scene_of, frames.apart, TrackSettings(), {"mocap": 1.0},
-        np.zeros(len(truth)),
-    )  # fmt: skip
+    rows = replace(frames, scale={"mocap": 1.0}, points=np.zeros(len(truth)))
     by_rows = replace(take, markers=None, others=rows)
     matched = [rows.matched(rows.scene(f, take.roots, take.angles)) for f in range(len(truth))]
     return truth.body, take, by_rows, matched

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -142,8 +143,10 @@ def followed(truth, rig, keypoints, sigma=8.0):
 
 def smoothed_of(truth, tracked, settings=DEFAULT, count=None, **options):
     """Smoothed frames, and what is told of them."""
-    frames = replace(tracked, results=tracked.results[:count], measurements=tracked.measurements[:count])
-    done = smooth_results(truth.body, frames, settings, **options)
+    tracker = copy(tracked.tracker)
+    tracker.settings = settings
+    frames = replace(tracked, results=tracked.results[:count], tracker=tracker)
+    done = smooth_results(frames, **options)
     return done.results, done.provenance
 
 

@@ -170,7 +170,7 @@ def test_smoothing_leaves_a_worse_minimum(bow):
         angles[trunk] += np.radians([25.0, -25.0])
         results[f] = replace(results[f], state=BodyState(state.T_world_root, angles))
     both = frames, replace(frames, results=results)
-    right, left = (smooth_results(body, one, settings).take.angles for one in both)
+    right, left = (smooth_results(one).take.angles for one in both)
     np.testing.assert_allclose(left[:, trunk], right[:, trunk], atol=np.radians(0.5))
 
 

@@ -49,8 +49,11 @@ def minimum(
     most : int, iterations at most
     tolerance : float, unitless, see `levenberg_marquardt`
     """
-    if held is not None and hard is None and (found := _of_keypoints(scene, held, matched, most, tolerance)):
-        return found
+    pixels = packed(matched, scene) if held is not None and hard is None else None
+    if held is not None and pixels is not None:  # keypoints alone, of a body without morphs: by the compiled solver
+        found = fit_pixels(scene.body, scene.state, scene.rig, pixels, held, max_iterations=most, tolerance=tolerance)
+        if found is not None:
+            return Minimum(scene.at(found.state), found.H, found.cost, found.iterations)
 
     def at(state: BodyState) -> list[AnyRows]:
         return rows(scene.at(state))
@@ -67,16 +70,3 @@ def minimum(
             start, tried = near.state, near.iterations
         fit = closed_fit(body, start, at, hard, max_iterations=most, tolerance=tolerance, damping=damping)
     return Minimum(scene.at(fit.state), fit.equations.matrix, fit.equations.cost, fit.iterations + tried)
-
-
-def _of_keypoints(
-    scene: Scene, held: tuple[BodyState, NDArray], matched: Sequence[Matched], most: int, tolerance: float
-) -> Minimum | None:
-    """The minimum by the compiled solver; None unless keypoints alone were measured, of a body without morphs."""
-    pixels = packed(matched, scene)
-    if pixels is None:
-        return None
-    fit = fit_pixels(
-        scene.body, scene.state, scene.rig, pixels, held, max_iterations=most, tolerance=tolerance
-    )
-    return None if fit is None else Minimum(scene.at(fit.state), fit.H, fit.cost, fit.iterations)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.sensors.base import Matched, Measurement
+from kinefit.sensors.base import Leftover, Matched, Measurement, leftovers_at
 from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.points.keypoints import pixels_of
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import joint_moves
 
@@ -47,6 +48,7 @@ class FrameResult:
     iterations : int
     matched : every measurement with the correspondences of the fit
     measurements : the measurements of this frame
+    leftovers : residuals of every sensor after the fit, in a frame that is kept
     """
 
     time: float
@@ -60,11 +62,32 @@ class FrameResult:
     iterations: int
     matched: tuple[Matched, ...] = ()
     measurements: tuple[Measurement, ...] = ()
+    leftovers: tuple[Leftover, ...] = ()
 
     @property
     def quality(self) -> float:
         """Mean quality of all segments, a share of 0 to 1."""
         return float(np.mean(self.segment_quality))
+
+    def kept(self, scene: Scene) -> FrameResult:
+        """What a take keeps of this frame: matches of keypoints, measurements of others, residuals; no whole images.
+
+        Parameters
+        ----------
+        scene : at the state, with the measurements and the velocity
+        """
+        pixels = tuple(pixels_of(self.matched))
+        packed = {m.sensor for m in pixels}
+        return replace(
+            self, matched=pixels, measurements=tuple(m.compact() for m in self.measurements if m.sensor not in packed),
+            leftovers=tuple(rest for m in self.matched for rest in leftovers_at(m, scene)),
+        )  # fmt: skip
+
+    def joined(self, later: FrameResult) -> FrameResult:
+        """The frame with what other sensors saw before the next one is due; both are kept frames."""
+        names = ("matched", "measurements", "leftovers")
+        both = {name: getattr(self, name) + getattr(later, name) for name in names}
+        return replace(later, time=self.time, **both)
 
 
 def deviations(

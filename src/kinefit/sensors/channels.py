@@ -172,12 +172,7 @@ def make_channels(
 
 def fitted_pixels(body: Body, channels: Channels, state: BodyState) -> NDArray:
     """(N, 2) [px] projections of every channel's point at a state; NaN behind the camera."""
-    x = body.positions(state, channels.points)[channels.column]
-    out = np.empty((len(x), 2))
-    for c, camera in enumerate(channels.rig):
-        in_camera = channels.camera == c
-        out[in_camera] = camera.project(x[in_camera])
-    return out
+    return channels.rig.project(body.positions(state, channels.points)[channels.column], channels.camera)
 
 
 def exchange(channels: Channels, frame: NDArray, swapped: NDArray) -> NDArray:

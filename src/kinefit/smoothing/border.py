@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.sensors.base import Matched
-from kinefit.smoothing.linearised import with_values
 from kinefit.smoothing.process_noise import DETECTOR_CORRELATION_TIME, SmoothTake, Strength
 from kinefit.smoothing.shape_errors import FrameMatches
 from kinefit.smoothing.spool import Spool
@@ -83,7 +82,7 @@ def with_border(
     others, prior = take.others, border.unknowns.information
     assert others is not None
     for _ in range(_ROUNDS):
-        take = replace(take, others=with_values(others, border.values))
+        take = replace(take, others=replace(others, values=border.values))
         take, S, b = _reduced(take, strength, border, window, overlap)
         told = np.flatnonzero(np.diag(S) > 0.0)  # of surfaces, and of what was never felt, the subject fit knows more
         if not len(told):
@@ -98,7 +97,7 @@ def with_border(
         border = replace(border, theta=theta, covariance=covariance)
         if step @ information @ step < _MAX_CHANGE_SIGMAS**2 * len(step):
             break
-    return replace(take, others=with_values(others, border.values)), border
+    return replace(take, others=replace(others, values=border.values)), border
 
 
 def _reduced(

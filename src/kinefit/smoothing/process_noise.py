@@ -9,17 +9,16 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._mapped import release, room
 from kinefit._threads import side_by_side
-from kinefit.bodies import Body, PointSet
-from kinefit.losses import Loss
+from kinefit.bodies import Body
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import Channels, joined
 from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.smoothing.foot_contacts import Contacts
-from kinefit.smoothing.linearised import Linearised, OtherSensors, squares_of, with_quadratic
+from kinefit.smoothing.packed_pixels import PackedPixels
 from kinefit.smoothing.shared_errors import SharedErrors, shared_by
-from kinefit.smoothing.spool import Spool, stretches
+from kinefit.smoothing.spool import Spool
+from kinefit.smoothing.tracked_frames import Linearised, TrackedFrames, squares_of, with_quadratic
 from kinefit.smoothing.unwrap import boxes
 from kinefit.solvers.trajectory.motion_prior import MotionPrior
 from kinefit.solvers.trajectory.seen_points import SeenPoints
@@ -64,57 +63,57 @@ class Strength:
 class SmoothTake:
     """Measurements of T frames with left-right swaps corrected, and states to start from.
 
-    `uv` (T, N, 2) [px], `confidence` (T, N); `swapped` (T, N) bool: channels whose sides were exchanged;
-    `observed` (T, D) bool: coordinates that a frame nearby observes on its own; `live` (T, n): liveliness, a factor on
-    the process noise; `markers`: labelled markers; `others`: measurements of all other sensors, `linear` their costs at
-    the states;
+    `pixels`, `markers`: keypoints and labelled markers; `others`: frames of all other sensors, `linear` their costs at
+    the states; `observed` (T, D) bool: coordinates that a frame nearby observes on its own; `live` (T, n): liveliness,
+    a factor on the process noise;
     `speed_std` (n,) [m/s, rad/s]: 90th percentile over frames; `one_view`: one camera is the only sensor, so no other
     view contradicts the errors of its keypoints.
     """
 
     body: Body
-    channels: Channels
-    points: PointSet
-    uv: NDArray
-    confidence: NDArray
-    swapped: NDArray
+    pixels: PackedPixels
     roots: NDArray
     angles: NDArray
     observed: NDArray
     live: NDArray
     dt: float
-    loss: Loss
     memory: tuple[float, float]
     contacts: Contacts | None = None
     markers: PackedMarkers | None = None
-    others: OtherSensors | None = None
+    others: TrackedFrames | None = None
     linear: Linearised | None = None
     speed_std: NDArray | None = None
     one_view: bool = False
+
+    @property
+    def channels(self) -> Channels:
+        """Channels of the keypoints."""
+        return self.pixels.channels
 
     def renewed(self, *, keep: bool = False) -> SmoothTake:
         """The take with all other sensors matched and linearised at its states; `keep` keeps the matches."""
         if self.others is None:
             return self
         matches = Spool[tuple[Matched, ...]]() if keep else None
-        return replace(self, linear=self.others.linearised(self.body, self.roots, self.angles, keep=matches))
+        return replace(self, linear=self.others.linearised(self.roots, self.angles, keep=matches))
 
     def part(self, frames: slice) -> SmoothTake:
         """Some frames of the take."""
-        names = ("uv", "confidence", "swapped", "roots", "angles", "observed", "live")
+        names = ("roots", "angles", "observed", "live")
         cut = {name: getattr(self, name)[frames] for name in names}
         return replace(
-            self, **cut, contacts=self.contacts and self.contacts.part(frames),
+            self, **cut, pixels=self.pixels.part(frames), contacts=self.contacts and self.contacts.part(frames),
             markers=self.markers and self.markers.part(frames),
             others=self.others and self.others.part(frames), linear=self.linear and self.linear.part(frames),
         )  # fmt: skip
 
     def solver_points(self, sigma: NDArray, shared: NDArray | None = None) -> SeenPoints:
         """Keypoints, markers and contacts for the solver, with `sigma` (N,) [px] and `shared` (N,), see `Strength`."""
-        errors = SharedErrors.of(self.channels, np.zeros(len(sigma)) if shared is None else shared, sigma)
+        p, share = self.pixels, np.zeros(len(sigma)) if shared is None else shared
+        errors = SharedErrors.of(p.channels, share, sigma)
         out = SeenPoints(
-            self.channels.rig, self.points, self.channels.camera, self.uv,
-            self.confidence / (np.square(sigma) * (1.0 - errors.share)), self.loss, member=errors.member,
+            p.channels.rig, p.points, p.channels.camera, p.uv,
+            p.confidence / (np.square(sigma) * (1.0 - errors.share)), p.loss, member=errors.member,
             shared=errors.variance,
         )  # fmt: skip
         in_metres = [block for block in (self.markers, self.contacts) if block is not None]
@@ -138,31 +137,6 @@ class SmoothTake:
         markers = self.markers and replace(self.markers, scale=_known(self.markers.scale, scale))
         others = self.others and replace(self.others, scale=_known(self.others.scale, scale))
         return replace(self, markers=markers, others=others)
-
-    def fitted(self, roots: NDArray, angles: NDArray) -> NDArray:
-        """(T, N, 2) [px] projections of the points at states (T, 4, 4), (T, D)."""
-        x = self.body.trajectories(roots, angles, self.points)
-        out = np.empty((*x.shape[:2], 2))
-        for c, camera in enumerate(self.channels.rig):
-            in_camera = self.channels.camera == c
-            out[:, in_camera] = camera.project(x[:, in_camera].reshape(-1, 3)).reshape(len(x), -1, 2)
-        return out
-
-    def factors(self, sigma: NDArray, fitted: NDArray) -> NDArray:
-        """(T, N) robust factor of every channel, 0 where undetected, with sigma (N,) [px] and projections (T, N, 2)."""
-        r2 = np.square(self.uv - fitted).sum(axis=2)
-        used = (self.confidence > 0) & np.isfinite(r2)
-        s2 = np.where(used, self.confidence * r2 / np.square(sigma), 0.0)
-        return np.where(used, self.loss.factor(s2), 0.0)
-
-    def factors_at_states(self, sigma: NDArray) -> NDArray:
-        """(T, N) robust factor of every channel at the take's states, 0 where undetected, with sigma (N,) [px]."""
-        out = room(self.confidence.shape)
-        for some in stretches(len(self.roots)):
-            part = self.part(some)
-            out[some] = part.factors(sigma, part.fitted(part.roots, part.angles))
-            release(self.uv, self.confidence, out)
-        return out
 
     def fit(self, strength: Strength, *, tolerance: float = 1e-5) -> tuple[Smoothed, Posterior]:
         """Solve all frames jointly from the take's states, with covariances; `tolerance` is unitless."""
@@ -343,13 +317,14 @@ def _accelerations(squares: NDArray, informed: NDArray, start: NDArray, groups: 
 
 def _pixels(take: SmoothTake, strength: Strength, post: Posterior) -> tuple[NDArray, NDArray, NDArray]:
     """Residuals (T, N, 2) [px], NaN for outliers; squared at full confidence (T, N), and the fit's variance [px²]."""
-    fitted = take.fitted(take.roots, take.angles)
-    inside = take.factors(strength.sigma, fitted) > MIN_INLIER_FACTOR
-    r2 = take.confidence * np.square(take.uv - fitted).sum(axis=2)
+    block = take.pixels
+    gaps = block.gaps(take.body, take.roots, take.angles)
+    inside = block.factors(gaps, strength.sigma) > MIN_INLIER_FACTOR
+    r2 = block.confidence * np.square(gaps).sum(axis=2)
     points = take.solver_points(strength.sigma)
     variance = points.variance(take.body, take.roots, take.angles, post.frames).sum(axis=2)
-    residuals = np.where(inside[..., None], take.uv - fitted, np.nan)
-    return residuals, np.where(inside, r2, np.nan), np.where(inside, take.confidence * variance, np.nan)
+    residuals = np.where(inside[..., None], gaps, np.nan)
+    return residuals, np.where(inside, r2, np.nan), np.where(inside, block.confidence * variance, np.nan)
 
 
 def _noise(channels: Channels, r2: NDArray, variance: NDArray, looks: float) -> NDArray:

@@ -21,9 +21,9 @@ from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import ChannelResiduals
 from kinefit.sensors.points.markers import MarkerMatched
 from kinefit.sensors.points.packed_markers import PackedMarkers
-from kinefit.smoothing.linearised import OtherSensors, squares_of
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
+from kinefit.smoothing.tracked_frames import TrackedFrames, squares_of
 from kinefit.solvers.bundle.border_frames import gram
 from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, point_derivatives, product
 from kinefit.solvers.trajectory.seen_points import SeenPoints
@@ -159,7 +159,7 @@ def leverages(J: NDArray, pushed: NDArray, alone: NDArray) -> NDArray:
 
 
 def other_noise(
-    body: Body, others: OtherSensors, matched: Sequence[tuple[Matched, ...]], roots: NDArray, angles: NDArray,
+    body: Body, others: TrackedFrames, matched: Sequence[tuple[Matched, ...]], roots: NDArray, angles: NDArray,
     pixels: Callable[[int], NDArray], *, half: int = 0, surfaces: bool = True, frames: NDArray | None = None,
 ) -> OtherNoise:  # fmt: skip
     """Estimate the noise of all sensors but the keypoints from their residuals at fitted states.
@@ -196,7 +196,7 @@ def other_noise(
                 stated[m.sensor].append(np.vstack([at, m.lasts / rows.weight[used]]))
                 independent |= {m.sensor} if m.independent else set()
         if surface:
-            settings = others.settings
+            settings = others.tracker.settings
             offset_stds = max(settings.skin_shift, _MIN_SURFACE_STD), settings.skin_turn
             skin = skin_of(scene, surface, *(offset_stds if body.tree.coordinates else _RIGID_SURFACE_STDS), matched[f])
             exact = ignores_surface_offsets(scene, settings, int(others.points[f]) + rows_of_points(scene, matched[f]))

@@ -10,25 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._mapped import release
 from kinefit._threads import side_by_side
-from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import hard_equations, looped
 from kinefit.findings import runs_of
 from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult, frame_result, frame_results
 from kinefit.frame.trust import unknown_joints
 from kinefit.sensors.base import Matched
 from kinefit.sensors.evidence import moves_points, near
-from kinefit.sensors.points.keypoints import pixels_of
-from kinefit.sensors.points.views import find_swaps, limb_groups
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.border import Border, with_border
 from kinefit.smoothing.foot_contacts import find_contacts
-from kinefit.smoothing.linearised import OtherSensors
 from kinefit.smoothing.process_noise import MIN_INLIER_FACTOR, SmoothTake, Strength, estimate, estimate_liveliness
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
-from kinefit.smoothing.tracked_frames import TrackedFrames, correct_swaps, without_bias
+from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.smoothing.windows import parts, solved, solved_with_covariances
 from kinefit.solvers.closed import Constraint, on_null_space, onto
@@ -66,7 +62,7 @@ class SmoothedTake:
 
 
 def smooth_results(
-    body: Body, frames: TrackedFrames, settings: TrackSettings, *, contacts: bool = False, up: str = "z",
+    frames: TrackedFrames, *, contacts: bool = False, up: str = "z",
     eye: NDArray | None = None, level: bool = True, windows: tuple[int, int] = (300, 60), border: Border | None = None,
 ) -> SmoothedTake:  # fmt: skip
     """Smooth tracked frames of any sensors jointly.
@@ -84,31 +80,26 @@ def smooth_results(
     windows : number of frames that are solved at a time, and that two neighbouring windows share
     border : the sensors' own unknowns, to start from
     """
-    take = replace(_take(as_tracked(body, frames, settings), settings), one_view=eye is not None)
-    channels, swapped = take.channels, take.swapped
+    body, settings = frames.tracker.body, frames.tracker.settings
+    take = replace(_take(as_tracked(frames), settings), one_view=eye is not None)
     strength, take, rounds = _estimate(take, settings, *windows)
     if border is not None and take.others is not None:
         take, border = with_border(take, strength, border, *windows)
     take, covariances, others_matched = solved_with_covariances(take, strength, *windows)
-    new_swaps = _swaps(take)
-    if not np.array_equal(new_swaps, swapped):
-        uv, confidence = correct_swaps(channels, new_swaps)
-        uv = without_bias(body, channels, uv, take.roots, take.angles)
-        take, swapped = replace(take, uv=uv, confidence=confidence, swapped=new_swaps), new_swaps
+    swaps = take.pixels.find_swaps(body, take.roots, take.angles)
+    if not np.array_equal(swaps, take.pixels.swapped):
+        take = replace(take, pixels=take.pixels.swapped_as(swaps, body, take.roots, take.angles))
         take, covariances, others_matched = solved_with_covariances(take, strength, *windows)
     for _ in range(_CONTACT_ROUNDS if contacts else 0):  # covariances stay those without: a contact is no measurement
-        found = find_contacts(body, take.roots, take.angles, frames.rate, up, eye, level=level)
+        found = find_contacts(body, take.roots, take.angles, frames.tracker.rate, up, eye, level=level)
         take, others_matched = solved(replace(take, contacts=found), strength, *windows)
     take = replace(take, angles=unwrap(body.tree, take.angles))
     hard = hard_equations(body)
     take = take if hard is None else _closed(take, hard)
     # Outliers and quality use the stated standard deviations, as in tracking: they compare between takes.
-    fit_weight = take.factors_at_states(strength.sigma)
-    for some in stretches(len(fit_weight)):
-        fit_weight[some] *= take.confidence[some] / np.square(strength.sigma)
-    release(fit_weight, take.confidence)
+    fit_weight = take.pixels.weights(body, take.roots, take.angles, strength.sigma)
     smoothed = _results(take, frames, covariances, others_matched, hard)
-    shared = SharedErrors.of(channels, strength.shared, strength.sigma)
+    shared = SharedErrors.of(take.channels, strength.shared, strength.sigma)
     return SmoothedTake(smoothed, take, others_matched, fit_weight, _provenance(take, strength, rounds), shared, border)
 
 
@@ -139,7 +130,7 @@ def _results(
             surfaces |= any(m.shows_surface for f in several for m in (() if others is None else others[f]))
         for result in made:
             out.append(result)
-    return _with_unknown_joints(body, out, round(_UNKNOWN_TIME * frames.rate)) if surfaces else out
+    return _with_unknown_joints(body, out, round(_UNKNOWN_TIME * frames.tracker.rate)) if surfaces else out
 
 
 def _result(
@@ -147,18 +138,12 @@ def _result(
     others: Sequence[tuple[Matched, ...]] | None,
 ) -> FrameResult:  # fmt: skip
     """Frame f of a solved take, from what the tracker found in it."""
-    state, weight = BodyState(take.roots[f], take.angles[f]), take.confidence[f] / np.square(take.channels.sigma)
+    state = BodyState(take.roots[f], take.angles[f])
     if take.others is None:
-        scene = frames.scene_of(state, tracked.time)
+        scene = frames.tracker.scene_of(state, tracked.time)
     else:
         scene = take.others.scene(f, take.roots, take.angles)
-    pixels = tuple(
-        replace(
-            m, uv=np.where(weight[:, None] > 0, take.uv[f], np.nan), weight=weight, swapped=take.swapped[f],
-            beside=m.measurement.layout.beside(scene),
-        )
-        for m in pixels_of(tracked.matched)
-    )  # fmt: skip
+    pixels = take.pixels.matched(f, tracked.matched, scene)
     markers = () if take.markers is None else take.markers.matched(f, scene)
     matched = (*pixels, *markers, *(() if others is None else others[f]))
     frame = frame_result(scene, covariance, matched, tracked.iterations, observed=take.observed[f])
@@ -187,35 +172,31 @@ def _with_unknown_joints(body: Body, results: Sequence[FrameResult], half: int) 
     )  # fmt: skip
 
 
-def as_tracked(body: Body, frames: TrackedFrames, settings: TrackSettings) -> SmoothTake:
+def as_tracked(frames: TrackedFrames) -> SmoothTake:
     """Measurements of tracked frames with the tracker's swaps and states, not smoothed."""
-    (channels, swapped), results = frames.pixels(), frames.results
+    results, body, settings = frames.results, frames.tracker.body, frames.tracker.settings
     roots, angles = map(np.stack, zip(*((r.state.T_world_root, r.state.angles) for r in results)))
-    names = tuple(channels.points.names[c] for c in channels.column)
-    points = PointSet(names, channels.points.segments[channels.column], channels.points.points[channels.column])
     all_observed = np.ones((len(roots), len(body.tree.coordinates)), bool)
-    uv, confidence = correct_swaps(channels, swapped)
-    markers, measurements = frames.packed_markers(body, settings)
-    sensors, others = dict.fromkeys((m.sensor for several in measurements for m in several), 1.0), None
+    pixels = frames.packed_pixels(roots, angles)
+    markers, others = frames.packed_markers(), None
+    packed = () if markers is None else markers.sensors
+    sensors = dict.fromkeys((m.sensor for r in results for m in r.measurements if m.sensor not in packed), 1.0)
     if sensors or body.closures:
-        rows = 2 * np.count_nonzero(channels.weight, axis=1)
+        rows = 2 * np.count_nonzero(pixels.channels.weight, axis=1)
         rows += 0 if markers is None else 3 * np.count_nonzero(markers.stated, axis=1)
-        others = OtherSensors(
-            frames.times, measurements, frames.scene_of, frames.apart, settings, sensors, rows
-        )  # fmt: skip
+        others = replace(frames, packed=packed, points=rows, scale=sensors)
     return SmoothTake(
-        body, channels, points, without_bias(body, channels, uv, roots, angles), confidence, swapped, roots, angles,
-        all_observed, np.ones((len(roots), body.tree.n_dofs)), 1.0 / frames.rate, settings.loss,
+        body, pixels, roots, angles, all_observed, np.ones((len(roots), body.tree.n_dofs)), 1.0 / frames.tracker.rate,
         (settings.acceleration_memory, settings.smooth_memory), markers=markers, others=others,
     )  # fmt: skip
 
 
 def _take(take: SmoothTake, settings: TrackSettings) -> SmoothTake:
     """The take with continuous angles, lost frames filled, and its observed coordinates."""
-    body, channels, rate = take.body, take.channels, 1.0 / take.dt
-    inliers = take.factors_at_states(channels.sigma) > MIN_INLIER_FACTOR
+    body, pixels, rate = take.body, take.pixels, 1.0 / take.dt
+    inliers = pixels.factors_at(body, take.roots, take.angles, pixels.channels.sigma) > MIN_INLIER_FACTOR
     alone, rows = _observed(take)
-    moves_keypoint = moves_points(body, take.points, inliers, take.roots, take.angles)
+    moves_keypoint = moves_points(body, pixels.points, inliers, take.roots, take.angles)
     observed = alone[0] & (moves_keypoint | looped(body)) | alone[1]
     lost = inliers.sum(axis=1) + 0.5 * rows < _MIN_PIXELS
     roots, angles = bridged(take.roots, unwrap(body.tree, take.angles), lost, settings.smooth_memory * rate)
@@ -239,7 +220,7 @@ def _observed(take: SmoothTake) -> tuple[list[NDArray], NDArray]:
             gaps = part.markers.gaps(part.body, part.roots, part.angles)
             rows[some] += 3 * np.count_nonzero(part.markers.factors(gaps) > MIN_INLIER_FACTOR, axis=1)
         if take.others is not None:
-            linear = take.others.linearised(take.body, take.roots, take.angles, frames=range(some.start, some.stop))
+            linear = take.others.linearised(take.roots, take.angles, frames=range(some.start, some.stop))
             found, rows[some] = [H + linear.H for H in found], rows[some] + linear.rows
         for observed, matrices in zip(out, found):
             variance = np.array([variances(H + prior)[6:] for H in matrices])
@@ -263,26 +244,10 @@ def _estimate(
     found = map(lively, left) if take.others is not None else side_by_side(lively, left)
     for i, (whole, kept) in enumerate(parts(len(take.roots), window, overlap)):
         piece = done[i] if i in done else next(found)
-        release(take.uv, take.confidence)
+        take.pixels.release()
         inside = slice(kept.start - whole.start, kept.stop - whole.start)
         roots[kept], angles[kept], live[kept] = piece.roots[inside], piece.angles[inside], piece.live[inside]
     return strength, replace(take, roots=roots, angles=angles, live=live), rounds
-
-
-def _swaps(take: SmoothTake) -> NDArray:
-    """(F, N) bool: channels to exchange with their left-right partner, by the smoothed motion."""
-    channels, groups = take.channels, limb_groups(take.body, take.channels)
-    if not len(channels.column):
-        return np.zeros((len(take.roots), 0), bool)
-    out = np.empty(take.confidence.shape, bool)
-    for some in stretches(len(out)):
-        fitted, given = take.fitted(take.roots[some], take.angles[some]), channels.part(range(*some.indices(len(out))))
-        uv, confidence = correct_swaps(given, np.zeros(fitted.shape[:2], bool))
-        uv = without_bias(take.body, channels, uv, take.roots[some], take.angles[some])
-        weight = confidence / np.square(channels.sigma)
-        sides_known = given.sides_known if given.sides_known is not None else [None] * len(fitted)
-        out[some] = [find_swaps(channels, groups, *of_frame) for of_frame in zip(uv, weight, fitted, sides_known)]
-    return out
 
 
 def _provenance(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, Any]:
@@ -290,7 +255,7 @@ def _provenance(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, 
     values = [strength.acceleration[0], *strength.acceleration[5:]]
     sigma = {
         label: {
-            take.points.names[i]: round(float(strength.sigma[i]), 2)
+            take.pixels.points.names[i]: round(float(strength.sigma[i]), 2)
             for i in np.flatnonzero(take.channels.source == q)
         }
         for q, label in enumerate(take.channels.sources)
@@ -304,7 +269,7 @@ def _provenance(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, 
         "pixel_sigma": sigma,
         "shared_errors": {
             label: {
-                take.body.tree.segments[take.points.segments[i]]: round(float(strength.shared[i]), 2)
+                take.body.tree.segments[take.pixels.points.segments[i]]: round(float(strength.shared[i]), 2)
                 for i in np.flatnonzero((take.channels.source == q) & (strength.shared > 0))
             }
             for q, label in enumerate(take.channels.sources)

@@ -225,8 +225,7 @@ def _residuals(take: SmoothTake) -> NDArray:
     values = []
     for some in chosen:
         part = take.part(some)
-        detected = part.confidence > 0
-        values.append(np.where(detected[..., None], part.uv - part.fitted(part.roots, part.angles), np.nan))
+        values.append(part.pixels.gaps(part.body, part.roots, part.angles))
         if len(parts) > _NOISE_STRETCHES:
             values.append(np.full((_SEPARATING_FRAMES, *values[0].shape[1:]), np.nan))
     return np.concatenate(values)

@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._mapped import release
 from kinefit._threads import side_by_side
 from kinefit.sensors.base import Matched
 from kinefit.smoothing.process_noise import SmoothTake, Strength
@@ -55,7 +54,7 @@ def solved(
         for (whole, kept), found in zip(windows, fits, strict=True):
             inside = slice(kept.start - whole.start, kept.stop - whole.start)
             roots[kept], angles[kept] = found.roots[inside], found.angles[inside]
-            release(take.uv, take.confidence)
+            take.pixels.release()
         take = replace(take, roots=roots, angles=angles)
     return take, matched
 
@@ -78,7 +77,7 @@ def solved_with_covariances(
         fit, post = next(fits)
         inside = slice(kept.start - whole.start, kept.stop - whole.start)
         roots[kept], angles[kept] = fit.roots[inside], fit.angles[inside]
-        release(take.uv, take.confidence)
+        take.pixels.release()
         speeds.append(_speed_std(post, take.dt)[max(inside.start - 1, 0) : inside.stop - 1])
         for covariance in post.frames[inside]:
             covariances.append(covariance[packed])
@@ -95,7 +94,7 @@ def linear_parts(
     """Windows of a take, with other sensors matched and linearised at its states; matches are added to `matched`."""
     spans, linear = [whole for whole, _ in windows], None
     if take.others is not None:
-        linear = take.others.windows(take.body, take.roots, take.angles, spans, matched, judge=judge)
+        linear = take.others.windows(take.roots, take.angles, spans, matched, judge=judge)
     for whole in spans:
         part = take.part(whole)
         yield part if linear is None else replace(part, linear=next(linear))

@@ -70,12 +70,8 @@ def fit_marker_steps(
         if progress:
             progress("frames", some.stop, len(times))
     angles[:] = unwrap(body.tree, angles)
-    nothing = _OnDemand(len(times), lambda f: ())
     results = _judged(body, markers, roots, angles) if judge else _blank(body, times, roots, angles)
-    return TrackedSteps(
-        results, nothing, nothing, times, recording.rate, tracker.scene_of, tracker.apart, list(range(len(times))),
-        tracker, True, markers=markers,
-    )  # fmt: skip
+    return TrackedSteps(results, times, tracker, list(range(len(times))), True, markers=markers)
 
 
 def _poses(body: Body, markers: PackedMarkers, start: BodyState | None = None) -> tuple[NDArray, NDArray]:

@@ -18,10 +18,9 @@ from kinefit.motion import Motion, Residuals
 from kinefit.sensors.base import Leftover, Matched, leftovers_at
 from kinefit.sensors.points.keypoints import KeypointMatched, pixels_of
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.border import Border
 from kinefit.smoothing.online.fixed_lag import FixedLag
-from kinefit.smoothing.online.lag_frame import KnownNoise, TrackerView
+from kinefit.smoothing.online.lag_frame import KnownNoise
 from kinefit.smoothing.sensor_noise import noise_of_sensors
 from kinefit.smoothing.shape_errors import shape_errors
 from kinefit.smoothing.smoother import as_tracked, smooth_results
@@ -62,7 +61,7 @@ class Estimation:
 
 
 def motion_of(
-    frames: TrackedFrames, subject: Subject, settings: TrackSettings, how: Estimation, *, up: str = "z",
+    frames: TrackedFrames, subject: Subject, how: Estimation, *, up: str = "z",
     name: str = "motion", more: Mapping[str, Any] | None = None, found: Sequence[SubjectFit] = (),
 ) -> Motion:  # fmt: skip
     """The motion of what was tracked.
@@ -71,12 +70,12 @@ def motion_of(
     ----------
     frames : TrackedFrames
     subject : Subject, with the body; its lengths are taken for exact where it does not tell how sure they are.
-    settings : TrackSettings
     up, name : of the motion
     more : further entries of `Motion.provenance`
     found : what all sensors were fitted with together, with its covariance
     """
-    body, rate, results = subject.body, frames.rate, frames.results
+    tracker, results = frames.tracker, frames.results
+    body, settings, rate = tracker.body, tracker.settings, tracker.rate
     smooth, lag, eye = how.smooth, how.lag, how.eye
     provenance: dict[str, Any] = dict(more or {})
     shared = None
@@ -85,7 +84,7 @@ def motion_of(
         held = how.contacts or eye is not None or not how.level
         border = next(filter(None, map(Border.of, found)), None)
         done = smooth_results(
-            body, frames, settings, contacts=held, up=up, eye=eye, level=how.level, border=border
+            frames, contacts=held, up=up, eye=eye, level=how.level, border=border
         )
         results, take, weight, shared = done.results, done.take, done.weight, done.shared
         provenance["smoothing"] = done.provenance
@@ -95,10 +94,9 @@ def motion_of(
             provenance["shape"] = dict(item for one in found for item in one.record().items())
     else:
         if lag is not None:
-            results, matched, provenance["fixed lag"] = _behind(frames, body, settings, lag, how.noise)
-        take = as_tracked(body, replace(frames, results=results), settings)
-        sigma = take.channels.sigma
-        weight = take.confidence / np.square(sigma) * take.factors(sigma, take.fitted(take.roots, take.angles))
+            results, matched, provenance["fixed lag"] = _behind(frames, lag, how.noise)
+        take = as_tracked(replace(frames, results=results))
+        weight = take.pixels.weights(body, take.roots, take.angles, take.channels.sigma)
         if take.others is not None and lag is None:
             of = take.others
             matched = Spool(of.matched(of.scene(f, take.roots, take.angles)) for f in range(len(results)))
@@ -110,7 +108,7 @@ def motion_of(
     def seen(f: int) -> tuple[Scene, list[Matched]]:
         """A frame's scene, with the body where it is when each sensor measured, and all that was matched in it."""
         r = results[f]
-        scene = frames.scene_of(r.state, r.time) if others is None else others.scene(f, take.roots, take.angles)
+        scene = tracker.scene_of(r.state, r.time) if others is None else others.scene(f, take.roots, take.angles)
         return scene, [*r.matched, *(() if matched is None else matched[f])]
 
     def with_markers(f: int) -> tuple[Scene, list[Matched]]:
@@ -122,8 +120,9 @@ def motion_of(
     residuals = {} if markers is None else markers.residuals(body, take.roots, take.angles)
     if markers is None or channels.sources or (others is not None and others.scale):
         again = seen if smooth or lag is not None else None
-        residuals = _residuals(len(results), again, frames.leftovers, packed) | residuals
-    release(channels.uv, channels.confidence, take.uv, take.confidence, weight)
+        residuals = _residuals(frames.results, again, packed) | residuals
+    take.pixels.release()
+    release(weight)
     stated = {name: float(np.median(channels.sigma[channels.source == q])) for q, name in enumerate(channels.sources)}
     provenance["contradictions"] |= cameras_apart(residuals, stated)
     # the tracker's own frames hold the surfaces' errors already
@@ -180,40 +179,38 @@ def _arrays(results: Iterable[FrameResult], body: Body, frames: int) -> dict[str
 
 
 def _behind(
-    frames: TrackedFrames, body: Body, settings: TrackSettings, lag: float, noise: KnownNoise | None
-) -> tuple[list[FrameResult], Spool[tuple[Matched, ...]], dict[str, Any]]:
+    frames: TrackedFrames, lag: float, noise: KnownNoise | None
+) -> tuple[Spool[FrameResult], Spool[tuple[Matched, ...]], dict[str, Any]]:
     """All frames as a live session has them a lag [s] behind, with angles that go on; and what there is to tell.
 
     Beside the results, which have the matches of keypoints alone, those of all other sensors.
     """
-    behind = FixedLag(TrackerView(body, frames.rate, settings, frames.scene_of, frames.apart), lag, noise=noise)
-    out: list[FrameResult] = []
-    matched = Spool[tuple[Matched, ...]]()
+    behind, body = FixedLag(frames.tracker, lag, noise=noise), frames.tracker.body
+    out, matched = Spool[FrameResult](), Spool[tuple[Matched, ...]]()
 
     def take(late: list[FrameResult]) -> None:
         for r in late:
             matched.append(tuple(m for m in r.matched if not isinstance(m, KeypointMatched)))
-            out.append(replace(r, matched=tuple(pixels_of(r.matched)), measurements=()))
+            out.append(replace(r, matched=tuple(pixels_of(r.matched))))
 
-    for result, measurements in zip(frames.results, frames.measurements):
-        take(behind.add(result, measurements, ahead=1))
+    for result in frames.results:
+        take(behind.add(result, result.measurements, ahead=1))
     take(behind.finish())
     angles = unwrap(body.tree, np.stack([r.state.angles for r in out]))
-    out = [replace(r, state=BodyState(r.state.T_world_root, q)) for r, q in zip(out, angles)]
-    return out, matched, {"seconds": round(behind.seconds, 4), **behind.noise.as_record(body)}
+    late = Spool(replace(r, state=BodyState(r.state.T_world_root, q)) for r, q in zip(out, angles))
+    return late, matched, {"seconds": round(behind.seconds, 4), **behind.noise.as_record(body)}
 
 
 def _residuals(
-    count: int, seen: Callable[[int], tuple[Scene, list[Matched]]] | None, tracked: Sequence[tuple[Leftover, ...]],
-    without: Collection[str] = (),
-) -> dict[str, Residuals]:  # fmt: skip
-    """Residuals of so many frames, of all sensors but some: as they were tracked, or of what was matched since."""
-    remains = Remains(count)
-    for f in range(count):
+    tracked: Sequence[FrameResult], seen: Callable[[int], tuple[Scene, list[Matched]]] | None, without: Collection[str]
+) -> dict[str, Residuals]:
+    """Residuals of all sensors but some: as the frames were tracked, or of what was matched since."""
+    remains = Remains(len(tracked))
+    for f in range(len(tracked)):
         if f % STRETCH == 0:
             remains.release()
         if seen is None:
-            remains.add(f, (rest for rest in tracked[f] if rest.label not in without))
+            remains.add(f, (rest for rest in tracked[f].leftovers if rest.label not in without))
             continue
         scene, matched = seen(f)
         remains.add(f, (rest for m in matched for rest in leftovers_at(m, scene)))

@@ -14,6 +14,7 @@ from kinefit._mapped import release
 from kinefit._records import restore_state, save_state
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import FileError, TrackingError
+from kinefit.frame.results import FrameResult
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.sensors.points.views import ViewBias
@@ -23,9 +24,7 @@ from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.subject.subject import Progress
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint, append_rows
-from kinefit.tracking.checkpoints.frame_file import KINDS
 from kinefit.tracking.recording import Recording
-from kinefit.tracking.session import KeptFrame
 from kinefit.tracking.tracker import Tracker
 
 _GIVE_UP = 150  # steps without a start before the first one: five seconds at 30 Hz, some minutes of searching
@@ -39,12 +38,11 @@ class TrackedSteps(TrackedFrames):
     Parameters
     ----------
     steps : numbers of the steps that were done, in order
-    tracker : that did it
     complete : whether all steps were done
     """
 
-    steps: list[int]
     tracker: Tracker
+    steps: list[int]
     complete: bool
 
 
@@ -53,19 +51,14 @@ class _Frames:
 
     def __init__(self, checkpoint: Checkpoint | None, recording: Recording) -> None:
         store = None if checkpoint is None else checkpoint.frames
-        places = [()] * len(KINDS) if store is None else store.places
-        self.results, self.measurements, self.leftovers = (
-            Spool[Any](store=store, tag=kind, places=there) for kind, there in zip(KINDS, places, strict=True)
-        )
+        self.results = Spool[FrameResult](store=store, places=() if store is None else store.places)
         self.place = {step: k for k, step in enumerate(() if store is None else store.steps)}
         self.written = 0  # rows of the table
         self.streams = [(k.camera, k.keypoint_set, k.names) for k in recording.keypoints]
 
-    def add(self, i: int, one: KeptFrame) -> None:
+    def add(self, i: int, one: FrameResult) -> None:
         count = len(self.place)
-        self.results.append(one.result, i)
-        self.measurements.append(one.measurements, i)
-        self.leftovers.append(one.leftovers, i)
+        self.results.append(one, i)
         self.place[i] = count  # last: Ctrl-C may come between
 
     def keep(self, checkpoint: Checkpoint, tracker: Tracker, at: int, anew: Callable[[], Tracker]) -> Tracker:
@@ -93,8 +86,7 @@ class _Frames:
         done = sorted(self.place)
         order = [self.place[i] for i in done]
         return TrackedSteps(
-            self.results.chosen(order), self.measurements.chosen(order), self.leftovers.chosen(order),
-            recording.times[done], recording.rate, tracker.scene_of, tracker.apart, done, tracker,
+            self.results.chosen(order), recording.times[done], tracker, done,
             not stopped and len(done) == len(recording),
         )  # fmt: skip
 
@@ -151,7 +143,7 @@ def run(
         found = tracker.update(recording.steps(i), time, others=others.at(time), guess=guess)
         if found is not None:
             moving = {"measurements": found.measurements, "velocity": tracker.speed}
-            frames.add(i, KeptFrame.of(found, tracker.scene_of(found.state, time).at(found.state, **moving)))
+            frames.add(i, found.kept(tracker.scene_of(found.state, time).at(found.state, **moving)))
         return found is not None
 
     stopped = False

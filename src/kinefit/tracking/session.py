@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,46 +14,10 @@ from kinefit.errors import ObservationError, choices
 from kinefit.frame.results import FrameResult
 from kinefit.motion import UP_AXES
 from kinefit.observations.arrays import numbers
-from kinefit.sensors.base import Leftover, Measurement, leftovers_at
 from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement, Layout, pixels_of
 from kinefit.sensors.scene import Scene
-from kinefit.smoothing.linearised import ApartRows, SceneOf
 from kinefit.smoothing.spool import Spool
-from kinefit.smoothing.tracked_frames import TrackedFrames
-
-
-@dataclass(frozen=True, eq=False)
-class KeptFrame:
-    """What is kept of a tracked frame: no whole images.
-
-    Parameters
-    ----------
-    result : FrameResult, with the matches of keypoints alone
-    measurements : what all sensors but the keypoints measured
-    leftovers : what the fit leaves over of every sensor
-    """
-
-    result: FrameResult
-    measurements: tuple[Measurement, ...]
-    leftovers: tuple[Leftover, ...]
-
-    @classmethod
-    def of(cls, result: FrameResult, scene: Scene) -> KeptFrame:
-        """Of a result as a tracker gives it; the scene is at its state, with its measurements and velocity."""
-        pixels = tuple(pixels_of(result.matched))
-        packed = {m.sensor for m in pixels}
-        return cls(
-            replace(result, matched=pixels, measurements=()),
-            tuple(m.compact() for m in result.measurements if m.sensor not in packed),
-            tuple(rest for m in result.matched for rest in leftovers_at(m, scene)),
-        )  # fmt: skip
-
-    def joined(self, later: KeptFrame) -> KeptFrame:
-        """With what other sensors saw before the next frame is due."""
-        return KeptFrame(
-            replace(later.result, matched=self.result.matched + later.result.matched),
-            self.measurements + later.measurements, self.leftovers + later.leftovers,
-        )  # fmt: skip
+from kinefit.smoothing.tracked_frames import TrackedFrames, TrackerLike
 
 
 class Session:
@@ -73,44 +37,35 @@ class Session:
 
     def clear(self) -> None:
         """Begin anew: another body, or another clock."""
-        self._results: list[FrameResult] = []
-        self._measurements, self._leftovers = Spool[tuple[Measurement, ...]](), Spool[tuple[Leftover, ...]]()
+        self._results = Spool[FrameResult]()
 
-    def _append(self, one: KeptFrame) -> None:
-        self._results.append(one.result)
-        self._measurements.append(one.measurements)
-        self._leftovers.append(one.leftovers)
+    def _append(self, one: FrameResult) -> None:
+        self._results.append(one)
+        self._last = one
 
     def add(self, result: FrameResult, scene: Scene) -> None:
         """Keep a result; a time before that of the last frame begins anew."""
-        new = KeptFrame.of(result, scene)
-        if not self._results:
+        new = result.kept(scene)
+        if not len(self):
             self._append(new)
             return
-        last = self._results[-1]
+        last = self._last
         ahead = round((result.time - last.time) * self.rate)
         if result.time < last.time:
             self.clear()
             self._append(new)
         elif ahead == 0:
-            new = replace(new, result=replace(new.result, time=last.time))
-            both = KeptFrame(last, self._measurements[-1], self._leftovers[-1]).joined(new)
-            self._results[-1], self._measurements[-1], self._leftovers[-1] = (
-                both.result, both.measurements, both.leftovers
-            )  # fmt: skip
+            self._results[-1] = self._last = last.joined(new)
         else:
             gap = result.time - last.time
             for k in range(1, ahead):
-                self._append(KeptFrame(unseen(last, last.time + gap * k / ahead), (), ()))
+                self._append(unseen(last, last.time + gap * k / ahead))
             self._append(new)
 
-    def frames(self, body: Body, scene_of: SceneOf, apart: ApartRows) -> TrackedFrames:
+    def frames(self, tracker: TrackerLike) -> TrackedFrames:
         """All of them, with the keypoints of whatever cameras in one layout."""
-        results = in_one_layout(body, self._results)
-        return TrackedFrames(
-            results, self._measurements[:], self._leftovers[:], np.array([r.time for r in results]),
-            self.rate, scene_of, apart,
-        )  # fmt: skip
+        results = in_one_layout(tracker.body, self._results[:])
+        return TrackedFrames(results, np.array([r.time for r in results]), tracker)
 
 
 def unseen(last: FrameResult, time: float) -> FrameResult:
@@ -136,10 +91,10 @@ def in_one_layout(body: Body, results: Sequence[FrameResult]) -> Sequence[FrameR
     layout, _ = sensor.layout(body, [(*key, tuple(names)) for key, names in streams.items()])
     place = {point: k for k, point in enumerate(layout.of_streams)}
     columns = {key: np.array([place[point] for point in one.of_streams], np.int64) for key, one in layouts.items()}
-    return [
+    return Spool(
         replace(r, matched=(_together(several, columns, layout, r.time),) if several else ())
         for r, several in zip(results, matches)
-    ]
+    )
 
 
 def _together(

@@ -21,7 +21,7 @@ from kinefit.initialization.from_depth import Start, StartSearch, sized_start, s
 from kinefit.markers.subject import MarkerSubject, fit_marker_subject
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import Channels, known_names, make_channels
-from kinefit.sensors.points.keypoints import keypoint_sigma
+from kinefit.sensors.points.keypoints import keypoint_sigma, pixels_of
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject import fit as joint
 from kinefit.subject.gear import Gear
@@ -35,7 +35,6 @@ from kinefit.tracking.placing import placed_cameras
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.recovery import is_rare
 from kinefit.tracking.run import OtherPeople, TrackedSteps, run, tracker_of
-from kinefit.tracking.session import KeptFrame
 from kinefit.tracking.unknowns import Unknowns, of_all, of_points
 
 _MAX_STEPS = 100  # steps that are tracked to find the person's shape ...
@@ -267,18 +266,19 @@ def _by_all(
             )
     except TrackingError as error:
         return person.reporting(shape=f"not found: {error.problem}")
-    shown = [bool(measured) or bool(r.keypoints) for measured in tracked.measurements]
-    good = [k for k, result in enumerate(tracked.results) if result.quality > _MIN_FRAME_QUALITY and shown[k]]
+    shown = [k for k, result in enumerate(tracked.results) if result.measurements or r.keypoints]
+    good = [k for k in shown if tracked.results[k].quality > _MIN_FRAME_QUALITY]
     if not good and person.recording.markers:  # a body of another size agrees with few of them
-        good = [k for k, measured in enumerate(tracked.measurements) if measured]
-    surfaces = any(not m.settled for k in good for m in tracked.measurements[k])
+        good = [k for k in shown if tracked.results[k].measurements]
+    surfaces = any(not m.settled for k in good for m in tracked.results[k].measurements)
     poses = many if surfaces or r.keypoints else _MARKER_POSES
     chosen = [good[k] for k in spread(len(good), poses)]
     if not chosen:
         return person
-    steps = [[*tracked.measurements[k], *(m.measurement for m in tracked.results[k].matched)] for k in chosen]
-    states: Sequence[BodyState] = [tracked.results[k].state for k in chosen]
-    times, velocities = [tracked.results[k].time for k in chosen], [_velocity(tracked.results, k) for k in chosen]
+    frames = [tracked.results[k] for k in chosen]
+    steps = [[*r.measurements, *(m.measurement for m in pixels_of(r.matched))] for r in frames]
+    states: Sequence[BodyState] = [r.state for r in frames]
+    times, velocities = [r.time for r in frames], [_velocity(tracked.results, k) for k in chosen]
 
     def fit(unknown: Unknowns, seen: Sequence[Sequence[Measurement]], near: Sequence[BodyState]) -> SubjectFit:
         world = unknown.world
@@ -325,11 +325,8 @@ def _fitted_at(
         tracker.others = tuple(others.at(float(times[step])))
         found = tracker.fitted(float(times[step]), recording.steps(step), poses[step]).result
         scene = tracker.scene_of(found.state, found.time).at(found.state, measurements=found.measurements)
-        frames.append(KeptFrame.of(found, scene))
-    return TrackedSteps(
-        [f.result for f in frames], [f.measurements for f in frames], [f.leftovers for f in frames],
-        times[sorted(poses)], recording.rate, tracker.scene_of, tracker.apart, sorted(poses), tracker, False,
-    )  # fmt: skip
+        frames.append(found.kept(scene))
+    return TrackedSteps(frames, times[sorted(poses)], tracker, sorted(poses), False)
 
 
 def _by_joint(person: SizedPerson, found: SubjectFit) -> SizedPerson:

@@ -202,10 +202,10 @@ class Tracker:
             raise ObservationError("the person was not found in this session", remedy=remedy)
         if contacts and not smooth:
             raise ObservationError("contacts=True needs smoothing", remedy="Leave out smooth=False.")
-        frames = self._session.frames(self.body, self.scene_of, self.apart)
+        frames = self._session.frames(self)
         subject, how = Subject.as_is(self.body), Estimation(smooth=smooth, contacts=contacts)
         more = {"frames": {"dropped": self.dropped, "late": self.late}}
-        return motion_of(frames, subject, self.settings, how, up=axis_of(self.up), name=name, more=more)
+        return motion_of(frames, subject, how, up=axis_of(self.up), name=name, more=more)
 
     def update(
         self, frames: Sequence[Any], time: float | None = None, *, others: Sequence[Scene] = (),

@@ -132,7 +132,7 @@ def motion_of_person(
     lag = how.lag if tracked.complete else None
     how = replace(how, smooth=how.smooth and tracked.complete, eye=eye, lag=lag)
     motion = motion_of(
-        tracked, person.subject, settings, how, up=recording.up, name=recording.name, more=more, found=person.joint
+        tracked, person.subject, how, up=recording.up, name=recording.name, more=more, found=person.joint
     )
     if not tracked.complete:
         raise TrackingInterrupted(motion, len(recording))

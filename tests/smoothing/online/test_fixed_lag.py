@@ -23,7 +23,6 @@ from kinefit.solvers.trajectory.marginal import leave
 from kinefit.solvers.trajectory.motion_prior import MotionPrior
 from kinefit.solvers.trajectory.smoothing import smooth
 from kinefit.subject.subject import Subject
-from kinefit.tracking.session import KeptFrame
 
 COLOUR = "left", "right"
 SIGMA = dict.fromkeys(COLOUR, 2.0)
@@ -56,11 +55,9 @@ def error(states):
 
 def whole(tracker, results, noise):
     """The whole take, smoothed with the same noise: states and covariances."""
-    kept = tuple(KeptFrame.of(r, tracker.scene_of(r.state, r.time)).measurements for r in results)
+    kept = [r.kept(tracker.scene_of(r.state, r.time)) for r in results]
     times = np.array([r.time for r in results])
-    take = as_tracked(
-        BODY, TrackedFrames(results, kept, (), times, RATE, tracker.scene_of, tracker.apart), STILL
-    )  # fmt: skip
+    take = as_tracked(TrackedFrames(kept, times, tracker))
     channels = take.channels
     take = replace(take, angles=unwrap(BODY.tree, take.angles))
     for _ in range(3):

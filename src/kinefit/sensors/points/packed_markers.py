@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -50,7 +50,7 @@ class PackedMarkers:
 
     @classmethod
     def of(
-        cls, body: Body, measurements: Sequence[Sequence[Measurement]], times: NDArray, loss: Loss
+        cls, body: Body, measurements: Iterable[Sequence[Measurement]], times: NDArray, loss: Loss
     ) -> PackedMarkers | None:
         """Markers of T frames with this loss, measured at the frames' times (T,) [s]; None if there are none."""
         streams, apart = dict[tuple[str, str], MarkerSensor](), set[str]()

@@ -19,7 +19,8 @@ from kinefit.errors import ObservationError
 from kinefit.frame.results import FrameResult, frame_result
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Measurement, of_kind
-from kinefit.smoothing.online.lag_frame import FrameCosts, KnownNoise, LagFrame, TrackerLike
+from kinefit.smoothing.online.lag_frame import FrameCosts, KnownNoise, LagFrame
+from kinefit.smoothing.tracked_frames import TrackerLike
 from kinefit.smoothing.unwrap import boxes, continued
 from kinefit.solvers.closed import on_null_space, onto
 from kinefit.solvers.equations import block_diagonal

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,45 +20,9 @@ from kinefit.sensors.channels import Channels
 from kinefit.sensors.evidence import moves_points
 from kinefit.sensors.points.keypoints import KeypointMatched, pixels_of
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.linearised import ApartRows, SceneOf
 from kinefit.smoothing.process_noise import MIN_INLIER_FACTOR
+from kinefit.smoothing.tracked_frames import TrackerLike
 from kinefit.solvers.equations import inverse, normal_equations
-
-
-class TrackerLike(Protocol):
-    """The attributes of a tracker that smoothing needs."""
-
-    @property
-    def body(self) -> Body:
-        """The tracked body."""
-
-    @property
-    def rate(self) -> float:
-        """Frame rate [Hz]."""
-
-    @property
-    def settings(self) -> TrackSettings:
-        """The tracker's settings."""
-
-    @property
-    def scene_of(self) -> SceneOf:
-        """(state, time) -> scene."""
-
-    @property
-    def apart(self) -> ApartRows:
-        """Scene -> rows against collisions of the body with itself."""
-
-
-@dataclass(frozen=True, eq=False)
-class TrackerView:
-    """The same attributes of a tracker that has finished."""
-
-    body: Body
-    rate: float
-    settings: TrackSettings
-    scene_of: SceneOf
-    apart: ApartRows
 
 
 @dataclass(eq=False)

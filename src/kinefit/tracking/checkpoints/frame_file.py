@@ -21,13 +21,10 @@ from kinefit.sensors.points.keypoints import Layout, Stream
 from kinefit.smoothing.record_classes import CODEC
 from kinefit.smoothing.spool import Store
 
-FORMAT = b"kinefit frames 2\n"
+FORMAT = b"kinefit frames 3\n"
 """First line of the file. The second is a digest of all that the result depends on."""
 
-KINDS = RESULTS, MEASUREMENTS, LEFTOVERS = range(3)
-"""Tags of the records of a frame."""
-
-_STATE = len(KINDS)  # tag of a state
+_FRAME, _STATE = range(2)  # tags of the records of a frame and of the tracker's state
 _LAYOUT = "layout "  # begins the names of layouts, their streams as JSON follow
 
 
@@ -45,7 +42,7 @@ class FrameFile(Store):
     at : int, step before which the last state was kept; None where there is none
     state : of the tracker then
     steps : numbers of the steps done until then, in their order
-    places : of each of `KINDS` the bytes at which the records of these steps begin
+    places : the bytes at which the records of these steps begin
     problem : what is wrong with what an earlier run left, "" for nothing
     """
 
@@ -60,7 +57,7 @@ class FrameFile(Store):
         self.at: int | None = None
         self.state: Any = None
         self.steps: list[int] = []
-        self.places = [array("q") for _ in KINDS]
+        self.places = array("q")
         self.problem = self._read(head)
 
     def _read(self, head: bytes) -> str:
@@ -74,15 +71,13 @@ class FrameFile(Store):
                 return "belongs to another take, changed files, other options or another version of kinefit"
             return "is damaged or has another format" if found else ""
         records, whole, last = self._records, self._records.start, b""
-        at, count, steps, places = 0, 0, list[int](), [array("q") for _ in KINDS]
+        at, count, steps, places = 0, 0, list[int](), array("q")
         for place, tag, number, data in records.scan():
-            if tag == _STATE and any(len(there) != len(steps) for there in places):
-                break
             if tag == _STATE:
                 at, count, whole, last = number, len(steps), records.end, data
-            elif tag in KINDS:
-                places[tag].append(place)
-                steps += [number] if tag == RESULTS else []
+            elif tag == _FRAME:
+                places.append(place)
+                steps.append(number)
         end, size = records.end, self._path.stat().st_size
         try:
             self.state = self._codec.decode(last) if last else None
@@ -91,7 +86,7 @@ class FrameFile(Store):
         records.cut(whole)
         if not last:
             return "is damaged, or ends before its first state" if size > whole else ""
-        self.at, self.steps, self.places = at, steps[:count], [there[:count] for there in places]
+        self.at, self.steps, self.places = at, steps[:count], places[:count]
         return f"is damaged or cut off at byte {end}" if size > end else ""
 
     def keep(self, at: int, state: Any) -> Any:
