@@ -24,7 +24,7 @@ from kinefit.errors import KinefitError
 from kinefit.readers.take.file import Take, read_take
 from kinefit.takes.track import track_take
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
-from kinefit.tracking.checkpoints.frame_file import FORMAT, KINDS
+from kinefit.tracking.checkpoints.frame_file import FORMAT, FRAME, STATE
 
 LONG, KILLS = 20_000, 20
 _FRAMES, _BYTES = amount(700, 160), 10_000  # frames of the take that is killed; of a frame, about
@@ -73,8 +73,7 @@ def _craft(folder: Path, key: str, way: str, evil: _Evil) -> None:
     elif way.startswith("with a checksum"):
         with Checkpoint(folder, key) as checkpoint:
             frames = checkpoint.frames
-            for kind in KINDS if way.endswith("frame") else (len(KINDS),):
-                frames._records.append(data, kind, 0)
+            frames._records.append(data, FRAME if way.endswith("frame") else STATE, 0)
             if way.endswith("frame"):
                 frames.keep(41, frames.state)
     else:

@@ -24,7 +24,8 @@ from kinefit.smoothing.spool import Store
 FORMAT = b"kinefit frames 3\n"
 """First line of the file. The second is a digest of all that the result depends on."""
 
-_FRAME, _STATE = range(2)  # tags of the records of a frame and of the tracker's state
+FRAME, STATE = range(2)
+"""Tags of the records of a frame and of the tracker's state."""
 _LAYOUT = "layout "  # begins the names of layouts, their streams as JSON follow
 
 
@@ -73,9 +74,9 @@ class FrameFile(Store):
         records, whole, last = self._records, self._records.start, b""
         at, count, steps, places = 0, 0, list[int](), array("q")
         for place, tag, number, data in records.scan():
-            if tag == _STATE:
+            if tag == STATE:
                 at, count, whole, last = number, len(steps), records.end, data
-            elif tag == _FRAME:
+            elif tag == FRAME:
                 places.append(place)
                 steps.append(number)
         end, size = records.end, self._path.stat().st_size
@@ -107,7 +108,7 @@ class FrameFile(Store):
             remedy = "Keep numbers, texts, arrays and lists of them in `state_attributes`, or leave out the checkpoint."
             raise ObservationError(problem, remedy=remedy) from error
         try:
-            self._records.append(data, _STATE, at)
+            self._records.append(data, STATE, at)
             self._records.flush()
         except OSError as error:
             raise self._full(error) from error
