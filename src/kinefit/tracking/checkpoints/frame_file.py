@@ -24,8 +24,7 @@ from kinefit.smoothing.spool import Store
 FORMAT = b"kinefit frames 3\n"
 """First line of the file. The second is a digest of all that the result depends on."""
 
-FRAME, STATE = range(2)
-"""Tags of the records of a frame and of the tracker's state."""
+FRAME, STATE = range(2)  # tags of the records of a frame and of the tracker's state
 _LAYOUT = "layout "  # begins the names of layouts, their streams as JSON follow
 
 
