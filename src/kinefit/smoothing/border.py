@@ -84,15 +84,15 @@ def with_border(
     for _ in range(_ROUNDS):
         take = replace(take, others=replace(others, values=border.values))
         take, S, b = _reduced(take, strength, border, window, overlap)
-        told = np.flatnonzero(np.diag(S) > 0.0)  # of surfaces, and of what was never felt, the subject fit knows more
-        if not len(told):
+        informed = np.flatnonzero(np.diag(S) > 0.0)  # of surfaces and of what no row moves, the subject fit knows more
+        if not len(informed):
             return take, border
-        own = np.ix_(told, told)
+        own = np.ix_(informed, informed)
         alike = max(DETECTOR_CORRELATION_TIME / take.dt, 1.0)
         information, theta, covariance = (S / alike + prior)[own], border.theta.copy(), border.covariance.copy()
-        step = np.linalg.solve((S + prior)[own], (b + prior @ (border.unknowns.mean - theta))[told])
-        theta[told] += step
-        covariance[told] = covariance[:, told] = 0.0
+        step = np.linalg.solve((S + prior)[own], (b + prior @ (border.unknowns.mean - theta))[informed])
+        theta[informed] += step
+        covariance[informed] = covariance[:, informed] = 0.0
         covariance[own] = inverse(information)
         border = replace(border, theta=theta, covariance=covariance)
         if step @ information @ step < _MAX_CHANGE_SIGMAS**2 * len(step):

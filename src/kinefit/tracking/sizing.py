@@ -73,7 +73,6 @@ class SizedPerson:
     start: KnownStart | None = None
     values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
-
     poses: Mapping[int, BodyState] = field(default_factory=dict)
     joint: tuple[SubjectFit, ...] = ()
     calibrated: Rig = field(default_factory=lambda: Rig(()))
