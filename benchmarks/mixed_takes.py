@@ -171,14 +171,14 @@ def record(draw: int, frames: int = round(RATE * SECONDS), *, depth: bool = True
     masks = np.array([[_mask(bare, i, camera, random) for i in range(len(truth))] for camera in rig])
     if not depth:
         none = np.zeros((0, *SENSOR.size[::-1]), np.uint16)
-        return Recording(truth, both, told, detected(truth, both, draw), masks, none, none, _markers(truth, random))
+        return Recording(truth, both, told, detected(truth, both, draw), masks, none, none, marked(truth, random))
     around = replace(bare, room=room(truth, front))
     video = _counts(simulate_depth(truth, front, SENSOR, seed=draw, scene=around), len(truth))
     T = np.array(truth.Ts_world_root)
     T[:, 1, 3] -= AWAY
     gone = replace(around, motion=replace(truth, Ts_world_root=T))
     empty = _counts(simulate_depth(gone.motion, front, SENSOR, seed=draw + 10_000, scene=gone), EMPTY)
-    return Recording(truth, both, told, detected(truth, both, draw), masks, video, empty, _markers(truth, random))
+    return Recording(truth, both, told, detected(truth, both, draw), masks, video, empty, marked(truth, random))
 
 
 def detected(
@@ -256,11 +256,12 @@ def _mask(scene: SimulatedScene, frame: int, camera: Camera, random: np.random.G
     return np.where(inside > 4.0 * MASK_SCALE * field / field.std(), 255, 0).astype(np.uint8)
 
 
-def _markers(truth: Motion, random: np.random.Generator) -> Markers:
-    points = truth.body.markers(MARKER_SET)
+def marked(truth: Motion, random: np.random.Generator, noise: np.random.Generator | None = None) -> Markers:
+    """45 markers, placed by `random`, as seen with `noise`; default: both of one."""
+    points, noise = truth.body.markers(MARKER_SET), noise or random
     placed = replace(points, points=points.points + random.normal(0.0, 0.008, points.points.shape))
-    x = truth.positions(placed) + random.normal(0.0, 0.001, (len(truth), len(points), 3))
-    x[random.random(x.shape[:2]) < 0.02] = np.nan
+    x = truth.positions(placed) + noise.normal(0.0, 0.001, (len(truth), len(points), 3))
+    x[noise.random(x.shape[:2]) < 0.02] = np.nan
     return Markers(points.names, RATE, x, up=truth.up, unit="mm")
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.figures import LEFT_OUT, amount, figure
 from benchmarks.mixed_runs import MIXES
 from benchmarks.mixed_takes import RATE, Recording, detected, record, take_text, write
-from kinefit import track_take
+from kinefit import Motion, track_take
 from kinefit.evaluation import angle_errors
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
@@ -26,6 +26,7 @@ from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import studio_rig
 
 FIRST, DRAWS, SURE = 7000, 8, 10.0  # [degrees]
+AGAIN = 100_000  # added to the draw whose noise a second take has
 CAMERAS = (2, 3, 4, 6, 8)
 SENSORS = ("cameras", "cameras_silhouettes", "cameras_depth", "cameras_markers", "depth_alone", "markers_sparse",
            "markers_alone")  # fmt: skip
@@ -58,8 +59,11 @@ def run() -> None:
         figure(f"setup_{more}_over_{few}_cameras", ratio, "", "<= 1", LEFT_OUT)
 
 
-def around(recording: Recording, folder: Path, cameras: int, draw: int) -> str:
-    """Take text of so many cameras around the same motion, each as wrong as those of the recording."""
+def around(recording: Recording, folder: Path, cameras: int, draw: int, seen: Motion | None = None) -> str:
+    """Take text of so many cameras around the same motion, each as wrong as those of the recording.
+
+    With `seen` the same cameras saw this motion, with noise of its own.
+    """
     random = np.random.default_rng([31, draw, cameras])
     rig = studio_rig(recording.truth, cameras=cameras)
     told = Rig(tuple(
@@ -68,7 +72,7 @@ def around(recording: Recording, folder: Path, cameras: int, draw: int) -> str:
     ))  # fmt: skip
     write_calibration(told, folder / f"calibration_{cameras}.toml")
     text = f'[take]\nrate = {RATE}\nup = "y"\n[calibration]\nfile = "{folder}/calibration_{cameras}.toml"\n'
-    points = detected(recording.truth, rig, draw, cameras=rig.names)
+    points = detected(seen or recording.truth, rig, draw + AGAIN * (seen is not None), cameras=rig.names)
     for name, own in zip(rig.names, points):
         np.save(folder / f"{cameras}_{name}.npy", own)
         text += f'[[camera]]\nname = "{name}"\n[[keypoints]]\ncamera = "{name}"\nformat = "mediapipe"\n'

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from kinefit.app.served import ScenePage
 from kinefit.batch.viewed import content_of, gather, has_same_cameras
 from kinefit.errors import ObservationError
 from kinefit.exporters.pictures.overlay import draw_overlay
-from kinefit.exporters.report.angles import Extremes, ranges_of, with_error
+from kinefit.exporters.report.angles import RangeChange, changes, with_error
 from kinefit.exporters.tables import curves, spoken
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
@@ -119,16 +120,8 @@ class Review(OpenResult):
         self._videos.close()
 
 
-@dataclass(frozen=True)
-class RangeChange:
-    """How the range of motion of one angle changed.
-
-    Parameters
-    ----------
-    angle : name in words, with its side
-    before, after, change : [deg] "value ± two standard deviations"; "" where it is not observed
-    is_clear : whether the change is larger than its two standard deviations
-    """
+class RangeRow(NamedTuple):
+    """How the range of motion of one angle changed, in words: "" where it is not observed."""
 
     angle: str
     before: str
@@ -146,7 +139,7 @@ class Comparison(OpenResult):
 
     Attributes
     ----------
-    ranges : tuple of RangeChange
+    ranges : tuple of RangeRow
     angles : {name: (before, after), two Curve} that both motions have
     times : of both, (F,) [s] from the first frame on
     scene : ScenePage with both
@@ -161,7 +154,7 @@ class Comparison(OpenResult):
         super().__init__(before / "motion.npz", after / "motion.npz")
         content = gather(self._files)
         first, second = content.motions
-        self.ranges = _changes(ranges_of(first), ranges_of(second))
+        self.ranges = tuple(_row(*key, of) for key, of in changes(first, second).items())
         known = {curve.name: curve for curve in curves(first) if curve.unit == "deg"}
         self.angles = {curve.name: (known[curve.name], curve) for curve in curves(second) if curve.name in known}
         self.times = first.times - first.times[0], second.times - second.times[0]
@@ -174,17 +167,7 @@ class Comparison(OpenResult):
         return np.column_stack([times, curve.values])[::step].round(3).tolist()
 
 
-def _changes(
-    before: dict[str, dict[str, Extremes | None]], after: dict[str, dict[str, Extremes | None]]
-) -> tuple[RangeChange, ...]:  # fmt: skip
-    found = []
-    for stem in before:
-        for side in before[stem]:
-            a, b = before[stem][side], after.get(stem, {}).get(side)
-            change = (b.span[0] - a.span[0], float(np.hypot(a.span[1], b.span[1]))) if a and b else None
-            spans = a and a.span, b and b.span, change
-            first, second, third = (with_error(*span) if span else "" for span in spans)
-            is_clear = change is not None and abs(change[0]) > change[1]
-            name = f"{spoken(stem)}, {side}" if side else spoken(stem)
-            found.append(RangeChange(name, first, second, third, is_clear))
-    return tuple(found)
+def _row(stem: str, side: str, of: RangeChange) -> RangeRow:
+    first, second = (with_error(*one.span) if one else "" for one in (of.before, of.after))
+    change = with_error(*of.change) if of.change else ""
+    return RangeRow(f"{spoken(stem)}, {side}" if side else spoken(stem), first, second, change, of.is_clear)

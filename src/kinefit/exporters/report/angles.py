@@ -226,6 +226,39 @@ def ranges_of(motion: Motion) -> dict[str, dict[str, Extremes | None]]:
     return out
 
 
+@dataclass(frozen=True)
+class RangeChange:
+    """How far one angle moved in two takes.
+
+    Parameters
+    ----------
+    before, after : None where it was not observed
+    change : range after minus range before, with two standard deviations [deg]; None where one was not observed.
+        The takes count as independent.
+    """
+
+    before: Extremes | None
+    after: Extremes | None
+    change: tuple[float, float] | None
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the change is larger than its two standard deviations."""
+        return self.change is not None and abs(self.change[0]) > self.change[1]
+
+
+def changes(before: Motion, after: Motion) -> dict[tuple[str, str], RangeChange]:
+    """{coordinate without its side, side: how its range changed} of all angles of the first motion."""
+    later = ranges_of(after)
+    found = {(stem, side): one for stem, of in ranges_of(before).items() for side, one in of.items()}
+    out = {}
+    for (stem, side), a in found.items():
+        b = later.get(stem, {}).get(side)
+        change = (b.span[0] - a.span[0], float(np.hypot(a.span[1], b.span[1]))) if a and b else None
+        out[stem, side] = RangeChange(a, b, change)
+    return out
+
+
 def ranges_table(motion: Motion) -> p.Html:
     """Two tables: what the body has twice, left beside right, and its middle."""
     paired: list[tuple[str, ...]] = []
