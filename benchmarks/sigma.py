@@ -37,7 +37,7 @@ MOST_FALSE, LEAST_FOUND = 5.0, 90.0  # [%]
 
 def of_draw(draw: int) -> dict[str, list[tuple[str, float, float, float]]]:
     """{set-up: joint, error of the range, its standard deviation, that of independent ends [deg]} of one draw."""
-    recording, out = record(draw, amount(FRAMES, 20)), {}
+    recording, out = record(draw, amount(FRAMES, 20), depth=False), {}
     with tempfile.TemporaryDirectory() as folder:
         write(recording, Path(folder))
         for setup in amount(SETUPS, SETUPS[:1]):

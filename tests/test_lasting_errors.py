@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.exporters.synthetic import smooth_motion
 
-from kinefit.lasting_errors import LastingErrors
+from kinefit.lasting_errors import LastingErrors, ParameterErrors, common
 from kinefit.motion import BRIEF_S
 
 FRAMES, RATE, TAU = 60, 60.0, 0.25
@@ -83,3 +83,54 @@ def test_parts_and_other_worlds_keep_them(motion):
     for old, new in ((0, 1), (3, 4), (KNEE, KNEE)):
         told = moved.std_of((5, 50), (new, new), (1, -1))
         assert told == pytest.approx(motion.std_of((5, 50), (old, old), (1, -1)))
+
+
+PARAMETERS = 5
+
+
+def fit_of_a_take(random, prior, measured):
+    """Covariance of a take's fit, its factor, and what turns measurements' whitened errors into estimates."""
+    covariance = np.linalg.inv(prior + measured.T @ measured)
+    return covariance, np.linalg.cholesky(covariance), random.standard_normal((3, PARAMETERS))
+
+
+def lasting_of(factor, values, covariance, prior, moves, names="abcde"):
+    known = ParameterErrors(tuple(names), values, covariance, prior, factor.T)
+    return LastingErrors(np.array([0]), (moves @ factor)[None], np.zeros((1, 3, 0)), TAU, known)
+
+
+def test_two_takes_share_the_errors_that_the_prior_leaves():
+    random, count = np.random.default_rng(4), 40_000
+    root = random.standard_normal((PARAMETERS, PARAMETERS)) + 2.0 * np.eye(PARAMETERS)
+    prior = root @ root.T
+    theta = np.linalg.solve(root.T, random.standard_normal((PARAMETERS, count)))  # prior mean: 0
+    takes, errors = [], []
+    for rows in (2, 3):  # of measurements that leave directions to the prior
+        measured = 3.0 * random.standard_normal((rows, PARAMETERS))
+        covariance, factor, moves = fit_of_a_take(random, prior, measured)
+        estimate = covariance @ measured.T @ (measured @ theta + random.standard_normal((rows, count)))
+        takes.append((factor, estimate, covariance, moves))
+        errors.append(moves @ (estimate - theta))
+    a, b = (lasting_of(f, e[:, 0], c, prior, m) for f, e, c, m in takes)
+    told = a.constant[0] @ common(a, b) @ b.constant[0].T
+    drawn = errors[0] @ errors[1].T / count
+    np.testing.assert_allclose(told, drawn, atol=0.03 * np.abs(drawn).max())
+    assert np.abs(drawn).max() > 0.2 * np.abs(errors[0] @ errors[0].T / count).max()
+    of_one = [
+        lasting_of(f, e[:, k], c, prior, m).parameters for k in range(200) for f, e, c, m in takes
+    ]  # fmt: skip
+    assert 0.5 < np.mean([one.misfit(other) for one, other in zip(of_one[::2], of_one[1::2])]) < 1.1
+
+
+def test_takes_of_two_people_and_other_cameras_share_nothing():
+    random = np.random.default_rng(5)
+    prior, measured = np.eye(PARAMETERS), 20.0 * random.standard_normal((PARAMETERS, PARAMETERS))
+    covariance, factor, moves = fit_of_a_take(random, prior, measured)
+    of = lambda values, names="abcde": lasting_of(factor, values, covariance, prior, moves, names)
+    someone = random.standard_normal(PARAMETERS)
+    assert common(of(someone), of(someone)) is not None
+    assert common(of(someone), of(random.standard_normal(PARAMETERS))) is None
+    assert common(of(someone), of(someone, "vwxyz")) is None
+    assert common(of(someone), replace(of(someone), parameters=None)) is None
+    part = common(of(someone), of(someone, "abxyz"))
+    assert np.trace(part) < np.trace(common(of(someone), of(someone)))

@@ -10,7 +10,7 @@ from kinefit.bodies import KinematicTree, catalogue, load_body
 from kinefit.bodies.serial import body_from_arrays, body_to_arrays
 from kinefit.errors import BodyError, ExportError, FileError
 from kinefit.exporters import write_motion
-from kinefit.lasting_errors import LastingErrors
+from kinefit.lasting_errors import LastingErrors, ParameterErrors
 from kinefit.motion import ARRAYS, Residuals
 from kinefit.readers.motion import read_motion
 
@@ -33,7 +33,9 @@ def rewritten(path, **changes):
 def written(tmp_path):
     motion = replace(smooth_motion(15, up="-z"), provenance={"track": {"accuracy": [8.0], "smooth": True}})
     factors = np.random.default_rng(0).standard_normal((2, 4, motion.dof_std.shape[1], 3)).astype(np.float16)
-    motion = replace(motion, lasting=LastingErrors(np.array([0, 5, 10, 14]), *factors, 0.3))
+    square = np.random.default_rng(1).standard_normal((2, 2, 2))
+    known = ParameterErrors(("thigh", "cam0 tx 1a2b"), np.array([1.0, 0.01]), *square, square[0].repeat(2, axis=0)[:3])
+    motion = replace(motion, lasting=LastingErrors(np.array([0, 5, 10, 14]), *factors, 0.3, known))
     write_motion(motion, tmp_path / "a.npz")
     return motion, tmp_path / "a.npz"
 
@@ -54,6 +56,10 @@ def test_everything_comes_back_exactly(written):
     for name in ("frames", "constant", "drift"):
         np.testing.assert_array_equal(getattr(back.lasting, name), getattr(motion.lasting, name), strict=True)
     assert back.lasting.drift_time == motion.lasting.drift_time
+    assert back.lasting.parameters.names == motion.lasting.parameters.names
+    for name in ("values", "covariance", "information", "directions"):
+        a, b = (getattr(m.lasting.parameters, name) for m in (back, motion))
+        np.testing.assert_array_equal(a, b, strict=True)
     assert_same_arrays(body_to_arrays(back.body), body_to_arrays(motion.body))
     np.testing.assert_array_equal(back.positions(), motion.positions())
 

@@ -55,7 +55,8 @@ def covariance(scene, noise, Sigma=None, cameras=None):
     known = replace(known, covariance=np.zeros_like(known.covariance) if Sigma is None else Sigma)
     n = subject.body.tree.n_dofs
     none = np.zeros((n, n)), Pushes.none(n)  # no other sensors
-    return systematic_errors(known, layout, state, weight, noise, SharedErrors.none(len(weight)), *none)
+    assumed = np.full(len(weight), SIGMA**2)
+    return systematic_errors(known, layout, state, weight, assumed, noise, SharedErrors.none(len(weight)), *none)
 
 
 def noise_of(channels, drift=0.0, shift=None):
@@ -92,7 +93,8 @@ def test_a_constant_error_changes_a_difference_of_frames_as_refitting_does(scene
     for frame in (20, 40):
         weight = channels.weight[frame]
         state = fit(subject.body, channels, channels.uv[frame], weight, MOTION.state(frame))
-        one = systematic_errors(exact, layout, state, weight, noise, SharedErrors.none(count), *none)
+        assumed = np.full(count, SIGMA**2)
+        one = systematic_errors(exact, layout, state, weight, assumed, noise, SharedErrors.none(count), *none)
         np.testing.assert_allclose(one.constant @ one.constant.T, one.dofs, atol=1e-12)
         factors.append(one.constant)
         fits.append((frame, weight, state))
@@ -105,6 +107,32 @@ def test_a_constant_error_changes_a_difference_of_frames_as_refitting_does(scene
     sure = alone[6:] < 0.15
     ratio = np.std(changes, axis=0)[6:][sure] / told[6:][sure]
     assert np.median(ratio) == pytest.approx(1.0, abs=0.12) and np.median(told[6:] / alone[6:]) < 0.9
+
+
+def test_white_errors_smaller_than_assumed_move_the_pose_less_as_refitting_does(scene):
+    subject, channels, weight, state = scene
+    random, exact, sigma = np.random.default_rng(2), channels.uv[20], 1.0
+    errors = sigma * random.standard_normal((80, *exact.shape))
+    moved = np.array([state.difference(fit(subject.body, channels, exact + e, weight, state)) for e in errors])
+    noise = replace(noise_of(channels), jitter=np.full(len(weight), sigma))
+    layout, n = Layout(channels, subject.body), subject.body.tree.n_dofs
+    none = np.zeros((n, n)), Pushes.none(n)
+    known = KeypointPriors.of(subject, channels, None)
+    assumed = 1.0 / np.where(weight > 0, weight, np.inf)
+    one, alone = (
+        systematic_errors(known, layout, state, weight, assumed, of, SharedErrors.none(len(weight)), *none, averaged=1)
+        for of in (noise, replace(noise, jitter=np.sqrt(assumed)))
+    )
+    sure = np.sqrt(np.diag(one.alone))[6:] < 0.1  # what is nearly free is not linear
+    posture = one.alone[:, 6:] @ subject.body.tree.posture_precision @ one.alone[6:]  # what the prior adds to the noise
+    told = 1.0 - (1.0 - one.white_dofs[6:][sure]) / 0.8  # the rest is of accelerations
+    found = (np.var(moved, axis=0) + np.diag(posture))[6:][sure] / np.diag(one.alone)[6:][sure]
+    np.testing.assert_allclose(found, told, rtol=0.25)
+    assert np.median(told) < 0.6
+    np.testing.assert_allclose(alone.white_dofs, 1.0, atol=1e-6)
+    assert one.white_joints.shape == one.joints.shape and np.all((one.white_joints >= 0.2) & (one.white_joints <= 1.0))
+    smoothed = systematic_errors(known, layout, state, weight, assumed, noise, SharedErrors.none(len(weight)), *none)
+    np.testing.assert_array_equal(smoothed.white_dofs, 1.0)  # a fit of each frame, whose errors are not averaged
 
 
 def test_a_shifted_camera_moves_the_pose_as_refitting_does(scene):

@@ -40,6 +40,8 @@ def write_motion(motion: Motion, path: str | PathLike[str]) -> None:
     arrays |= {f"body/{key}": array for key, array in body_to_arrays(motion.body).items()}
     if motion.lasting is not None:
         arrays |= arrays_of(motion.lasting, form.LASTING_SHAPES, "lasting/")
+        if motion.lasting.parameters is not None:
+            arrays |= arrays_of(motion.lasting.parameters, form.PARAMETER_SHAPES, "lasting/parameters/")
     for sensor, residuals in motion.residuals.items():
         shapes = form.RESIDUAL_SHAPES | form.SURFACE_SHAPES
         arrays |= arrays_of(residuals, shapes, f"residuals/{quote(sensor, safe='')}/")

@@ -16,6 +16,7 @@ F frames, S segments, D coordinates; metres, radians, seconds, pixels; float64 u
     body/...                         the fitted body, in the format of `kinefit.bodies.serial`
     lasting/frames (K,)              int, key frames of the errors that frames have in common; all of lasting/ optional
     lasting/constant (K, 6 + D, k)  drift (K, 6 + D, m)  drift_time ()   float16, see `kinefit.lasting_errors`; [s]
+    lasting/parameters/names (p,)  values (p,)  covariance (p, p)  information (p, p)  directions (k, p)     optional
     residuals/SENSOR/names (K,)  segments (K,)        points of a sensor, and the segment of each
     residuals/SENSOR/unit ()         "px" or "m"
     residuals/SENSOR/values (F, K, N)                 measured minus fitted, NaN if unobserved; N = 2 or 3
@@ -29,6 +30,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
@@ -38,7 +40,7 @@ from kinefit._arguments import checked
 from kinefit._files import read_npz, regular
 from kinefit.bodies.serial import below, body_from_arrays, fields_of, prefixes
 from kinefit.errors import FileError, KinefitError, command
-from kinefit.lasting_errors import LastingErrors
+from kinefit.lasting_errors import LastingErrors, ParameterErrors
 from kinefit.motion import Motion, Residuals
 
 FORMAT, VERSION = "kinefit motion", 1
@@ -50,7 +52,10 @@ RESIDUAL_SHAPES = {
     "names": "k$", "segments": "k<S", "unit": "$", "values": "F k n", "weights": "F k", "measured": "F k n",
     "swapped": "F",
 }  # fmt: skip
-LASTING_SHAPES = {"frames": "K<F", "constant": "K N s!", "drift": "K N d!", "drift_time": ""}
+LASTING_SHAPES = {"frames": "K<F", "constant": "K N C!", "drift": "K N d!", "drift_time": ""}
+PARAMETER_SHAPES = {
+    "names": "P$", "values": "P!", "covariance": "P P!", "information": "P P!", "directions": "C P!",
+}  # fmt: skip
 SURFACE_SHAPES = {"rms": "F k", "count": "F k"}
 _REMEDY = "Write it again with kinefit, or copy it again from its source."
 
@@ -121,6 +126,9 @@ def _motion(arrays: Mapping[str, NDArray]) -> Motion:
     lasting = None
     if "lasting/frames" in arrays:
         lasting = LastingErrors(**fields_of(arrays, LASTING_SHAPES, sizes, "lasting/"))
+    if lasting is not None and "lasting/parameters/names" in arrays:
+        known = ParameterErrors(**fields_of(arrays, PARAMETER_SHAPES, sizes, "lasting/parameters/"))
+        lasting = replace(lasting, parameters=known)
     return Motion(body=body, **own, residuals=residuals, provenance=provenance, lasting=lasting)
 
 

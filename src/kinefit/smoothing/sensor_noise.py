@@ -47,16 +47,18 @@ class Pushes(NamedTuple):
     ----------
     constant, drift : (k, n) of errors that last for the whole take, and of those that drift
     rest : (n, n) Σ s sᵀ of the gradients s of errors that are others in every frame
+    surplus : (n, n) Σ s sᵀ of what the fit assumes beyond the jitter, see `LastingPushes`
     """
 
     constant: NDArray
     drift: NDArray
     rest: NDArray
+    surplus: NDArray
 
     @classmethod
     def none(cls, n: int) -> Pushes:
         """Of no sensor."""
-        return cls(np.zeros((0, n)), np.zeros((0, n)), np.zeros((n, n)))
+        return cls(np.zeros((0, n)), np.zeros((0, n)), *np.zeros((2, n, n)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +69,13 @@ class LastingPushes:
     ----------
     per_unit : of each of these frames (k, n) gradients by a unit of each error, averaged over the frames within the
         correlation time of the motion
-    constant, drift : (k,) standard deviations of the errors
+    stds : (3, k) standard deviations of constant errors, of those that drift, and of the surplus: what the fit assumes
+        to be white beyond the errors that are
     drift_time : [s] in which the correlation of the drift falls to 1/e
     """
 
     per_unit: Sequence[NDArray]
-    constant: NDArray
-    drift: NDArray
+    stds: NDArray
     drift_time: float
 
 
@@ -104,16 +106,16 @@ class OtherNoise:
         """Of one of `frames`."""
         k, rest = int(np.searchsorted(self.frames, f)), _square(self.rest[f])
         per_unit = [one.per_unit[k] for one in self.lasting]
-        constant, drift = (
-            np.concatenate([np.zeros((0, len(rest))), *(std[:, None] * push for std, push in zip(stds, per_unit))])
-            for stds in ([one.constant for one in self.lasting], [one.drift for one in self.lasting])
+        none, pushes = np.zeros((0, len(rest))), list(zip((one.stds for one in self.lasting), per_unit))
+        constant, drift, surplus = (
+            np.concatenate([none, *(stds[part][:, None] * push for stds, push in pushes)]) for part in range(3)
         )
-        return Pushes(constant, drift, rest)
+        return Pushes(constant, drift, rest, gram(surplus, surplus))
 
     @property
     def drift_times(self) -> list[float]:
         """[s] of each kind of sensor that drifts."""
-        return [one.drift_time for one in self.lasting if np.any(one.drift > 0.0)]
+        return [one.drift_time for one in self.lasting if np.any(one.stds[1] > 0.0)]
 
     def __add__(self, other: OtherNoise) -> OtherNoise:
         """The noise of both, of different sensors."""
@@ -177,7 +179,7 @@ def other_noise(
     upper, frames = np.triu_indices(body.tree.n_dofs), np.arange(T) if frames is None else frames
     information, skins, rest = np.zeros((3, T, len(upper[0])))
     residuals, pushes = ChannelResiduals(), Spool[list[_Push]]()
-    absorbed, stated = defaultdict[str, list[NDArray]](list), defaultdict[str, list[NDArray]](list)
+    absorbed, stated, assumed = (defaultdict[str, list[NDArray]](list) for _ in range(3))
     independent = set[str]()
     leverage_frames = set(np.linspace(0, T - 1, min(_LEVERAGE_FRAMES, T)).astype(int).tolist())
     for f in range(T):
@@ -194,6 +196,7 @@ def other_noise(
                 information[f] += gram(J, w[:, None] * J)[upper]
                 pushed.append((m.sensor, *_summed(at, w[:, None] * J, w)))
                 stated[m.sensor].append(np.vstack([at, m.lasts / rows.weight[used]]))
+                assumed[m.sensor].append(np.vstack([at, scale**2 / rows.weight[used]]))
                 independent |= {m.sensor} if m.independent else set()
         if surface:
             settings = others.tracker.settings
@@ -214,16 +217,15 @@ def other_noise(
         leverage = _means(absorbed[sensor], values.shape[1:]).mean(axis=1)
         noise = variance_components(values, others.times, leverage=leverage, window=2 * half + 1)
         found[sensor] = noise
-        stated_means = _means(stated[sensor], values.shape[1:])
-        stds[sensor] = _lasting(noise, leverage, stated_means, sensor in independent)
+        systematic, white = (_means(of[sensor], values.shape[1:]) for of in (stated, assumed))
+        stds[sensor] = _lasting(noise, leverage, systematic, white, sensor in independent)
     per_unit, asked = {sensor: Spool[NDArray]() for sensor in found}, set(frames.tolist())
     for f, (near, sums) in enumerate(_window_means(pushes, half, stds, body.tree.n_dofs)):
         rest[f] = skins[near].mean(axis=0)
         for sensor, mean in sums.items() if f in asked else ():
             per_unit[sensor].append(_with_shared(mean).astype(np.float32))
     lasting = tuple(
-        LastingPushes(per_unit[sensor], constant.ravel(), drift.ravel(), found[sensor].drift_time)
-        for sensor, (constant, drift) in stds.items()
+        LastingPushes(per_unit[sensor], of.reshape(3, -1), found[sensor].drift_time) for sensor, of in stds.items()
     )  # fmt: skip
     return OtherNoise(information, rest, lasting, frames, found)
 
@@ -315,9 +317,9 @@ def marker_noise(
         noise = variance_components(gaps[:, own], markers.times, leverage=leverage, window=2 * half + 1)
         seen = weight[:, own] > 0.0
         stated = np.where(seen, 1.0 / np.where(seen, markers.stated[:, own], 1.0), 0.0)
-        stated = MarkerMatched.lasts * filled(stated.sum(axis=0), np.count_nonzero(seen, axis=0))
+        assumed = np.repeat(filled(stated.sum(axis=0), np.count_nonzero(seen, axis=0))[:, None], 3, axis=1)
         found[sensor], drift_time = noise, min(drift_time, noise.drift_time)
-        stds[sensor] = _lasting(noise, leverage, np.repeat(stated[:, None], 3, axis=1), MarkerMatched.independent)
+        stds[sensor] = _lasting(noise, leverage, MarkerMatched.lasts * assumed, assumed, MarkerMatched.independent)
     per_unit = Spool[NDArray]()
     for some in stretches(T, MATRIX_FRAMES):
         asked = frames[(frames >= some.start) & (frames < some.stop)]
@@ -333,8 +335,7 @@ def marker_noise(
         for mean in (total[stop - first[0]] - total[first - first[0]]) / (stop - first)[:, None, None, None]:
             of_sensors = [_with_shared(mean[markers.columns(sensor)]) for sensor in markers.sensors]
             per_unit.append(np.concatenate(of_sensors).astype(np.float32))
-    constant, drift = (np.concatenate([std[k].ravel() for std in stds.values()]) for k in (0, 1))
-    lasting = LastingPushes(per_unit, constant, drift, drift_time)
+    lasting = LastingPushes(per_unit, np.concatenate([of.reshape(3, -1) for of in stds.values()], axis=1), drift_time)
     posture = block_diagonal(np.zeros((6, 6)), body.tree.posture_precision)
     # Neighbouring frames repeat the same error of the prior, which counts where the cost is flat.
     of_prior = np.broadcast_to(posture[np.triu_indices(len(posture))], information.shape)
@@ -347,10 +348,11 @@ def filled(total: NDArray, count: NDArray) -> NDArray:
 
 
 def _lasting(
-    found: VarianceComponents, leverage: NDArray, stated: NDArray, independent: bool
-) -> tuple[NDArray, NDArray]:
-    """(C + 1, A) standard deviations of constant errors and of those that drift; the last row is what channels share.
+    found: VarianceComponents, leverage: NDArray, stated: NDArray, assumed: NDArray, independent: bool
+) -> NDArray:
+    """(3, C + 1, A) standard deviations of constant errors and of those that drift, and the surplus of `LastingPushes`.
 
+    The last of C + 1 is what channels share. The surplus is what `assumed` (C, A), a variance, exceeds white errors by.
     What `stated` (C, A), a variance, exceeds the estimate by, drifts: at least for as long as a posture lasts. A share
     of it counts, which falls with the number of independent channels, each counted by 1 − leverage (C,): their
     residuals would show a larger error. `stated` itself counts as `_STATED_CHANNELS` channels. If channels are not
@@ -361,7 +363,8 @@ def _lasting(
     excess = share * np.maximum(stated - found.systematic[:, None] ** 2, 0.0)
     constant = np.broadcast_to(np.hypot(found.bias, found.bias_error)[:, None], stated.shape)
     drift = np.sqrt(found.smoothed_drift[:, None] ** 2 + excess)
-    return np.vstack([constant, found.shared[0]]), np.vstack([drift, np.zeros(stated.shape[1])])
+    surplus, none = np.sqrt(np.maximum(assumed - found.white[:, None] ** 2, 0.0)), np.zeros(stated.shape[1])
+    return np.stack([np.vstack(one) for one in ((constant, found.shared[0]), (drift, none), (surplus, none))])
 
 
 def _with_shared(pushes: NDArray) -> NDArray:
@@ -388,10 +391,10 @@ def _means(entries: Sequence[NDArray], shape: tuple[int, ...]) -> NDArray:
 
 
 def _window_means(
-    pushes: Spool[list[_Push]], half: int, stds: Mapping[str, tuple[NDArray, NDArray]], n: int
+    pushes: Spool[list[_Push]], half: int, stds: Mapping[str, NDArray], n: int
 ) -> Iterator[tuple[slice, dict[str, NDArray]]]:
     """For every frame the window of `half` frames to either side, and each sensor's mean w J (C, A, n) over it."""
-    T, sums = len(pushes), {sensor: np.zeros((len(std) - 1, std.shape[1], n)) for sensor, (std, _) in stds.items()}
+    T, sums = len(pushes), {sensor: np.zeros((std.shape[1] - 1, std.shape[2], n)) for sensor, std in stds.items()}
     for last in range(T + half):
         for f, sign in ((last, 1.0), (last - 2 * half - 1, -1.0)):
             for sensor, at, push, _ in pushes[f] if 0 <= f < T else ():

@@ -8,6 +8,7 @@ Parameters of surfaces alone (girths) are excluded: `frame.skin` accounts for su
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +20,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure
 from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.geometry.camera import Rig
-from kinefit.lasting_errors import between
+from kinefit.lasting_errors import ParameterErrors, between
 from kinefit.rows import weaker
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.scene import Scene
@@ -46,11 +47,13 @@ class ShapeErrors:
     frames : (K,) int
     joints : (K, S, 3) [m²] of the joint centres along the world's axes
     factors : (K, n, q) [m, rad] of the degrees of freedom's covariance
+    parameters : the q parameters, with `directions` (q, q) to the columns of `factors`
     """
 
     frames: NDArray
     joints: NDArray
     factors: NDArray
+    parameters: ParameterErrors | None = None
 
     @cached_property
     def dofs(self) -> NDArray:
@@ -101,7 +104,21 @@ def shape_errors(
         whole = moves @ response + matches.stretch(step)
         factors.append(response @ root)
         joints.append(np.einsum("sap,pq,saq->sa", whole, Sigma, whole, optimize=True))
-    return ShapeErrors(np.asarray(frames), np.maximum(joints, 0.0), np.array(factors))
+    known = parameter_errors(found, root, np.flatnonzero(used))
+    return ShapeErrors(np.asarray(frames), np.maximum(joints, 0.0), np.array(factors), known)
+
+
+def parameter_errors(found: SubjectFit, root: NDArray, used: NDArray) -> ParameterErrors:
+    """Some parameters (q,) int of a fit, with their errors `root` (q, m), of which root rootᵀ is the covariance."""
+    names, cameras = list(found.names), found.cameras
+    if cameras is not None:
+        told = cameras.rig if cameras.calibrated is None else cameras.calibrated
+        first = len(names) - len(cameras.names)
+        for k, name in enumerate(names[first:]):
+            pose = told[cameras.free[k // 6]].T_camera_world
+            names[first + k] = f"{name} {hashlib.sha256(pose.tobytes()).hexdigest()[:8]}"
+    information = found.prior.information[np.ix_(used, used)]
+    return ParameterErrors(tuple(names[k] for k in used), found.mean[used], root @ root.T, information, root.T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,18 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._mapped import room
-from kinefit.bodies import BodyState, KinematicTree
+from kinefit.bodies import Body, BodyState, KinematicTree
 from kinefit.correspondences import _kernels, targets
 from kinefit.correspondences.closures import closed_at
 from kinefit.frame.results import FrameResult
-from kinefit.lasting_errors import LastingErrors, key_frames
+from kinefit.lasting_errors import LastingErrors, ParameterErrors, key_frames
 from kinefit.rows import Rows
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.points.keypoints import Layout
 from kinefit.sensors.settings import CameraErrors
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise, Pushes, covariance_alone, filled, leverages
-from kinefit.smoothing.shape_errors import SAMPLED_FRAMES, ShapeErrors
+from kinefit.smoothing.shape_errors import SAMPLED_FRAMES, ShapeErrors, parameter_errors
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import stretches
 from kinefit.solvers.bundle.border_frames import gram
@@ -41,7 +41,7 @@ from kinefit.solvers.trajectory.variance_components import VarianceComponents, v
 from kinefit.subject.matched_frames import closing_moves, point_moves
 from kinefit.subject.point_moves import ClosureMoves, PointMoves
 from kinefit.subject.sensor_parameters import CameraExtrinsics, same_cameras
-from kinefit.subject.subject import Subject
+from kinefit.subject.subject import Subject, SubjectFit
 
 Answers = Callable[[Sequence[int], Sequence[NDArray]], ShapeErrors]
 """(frames, covariance of each on its own) -> variances that the uncertainty of the shape adds to them."""
@@ -49,6 +49,8 @@ Answers = Callable[[Sequence[int], Sequence[NDArray]], ShapeErrors]
 MOTION_CORRELATION_TIME = 0.1
 """[s] within which the motion correlates frames: an acceleration lasts about twice that."""
 
+_BY_MEASUREMENTS = 0.8  # of a smoothed fit's variance, by errors of measurements, the rest by accelerations. 0.78 to
+# 0.83 by the spectrum of a motion prior that averages 0.2 s, at 30 to 100 Hz, with accelerations of 0.05 to 0.3 s
 _DIRECTIONS = 120  # of lasting errors that are kept. The sigma of differences on the balancing trial is within 0.3 %
 # of that with all; with 60 within 6 %, with 20 within 43 %
 _NOISE_STRETCHES = 6  # of a long take, from which the detectors' noise is estimated: 12,000 frames are enough
@@ -65,6 +67,7 @@ class SystematicErrors:
     joints : (S, 3) [m²] variance of the joint centres along the world's axes
     alone : (n, n) covariance of the frame on its own, prior included
     constant, drift : (n, k) factors of what of `dofs` comes from constant errors and the shape, and from drift
+    white_dofs, white_joints : (n,), (S, 3) share 0..1 of the fit's own variance that white errors cause
     """
 
     dofs: NDArray
@@ -72,12 +75,14 @@ class SystematicErrors:
     alone: NDArray
     constant: NDArray
     drift: NDArray
+    white_dofs: NDArray
+    white_joints: NDArray
 
 
 def with_systematic_errors(
     results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray,
     others: OtherNoise | None = None, answers: Sequence[Answers] = (), *,
-    cameras: CameraErrors | None = None, shared: SharedErrors | None = None,
+    cameras: CameraErrors | None = None, shared: SharedErrors | None = None, smoothed: bool = True,
 ) -> tuple[Iterator[FrameResult], VarianceComponents, LastingErrors]:  # fmt: skip
     """Add systematic errors and the uncertainty of the shape to standard deviations.
 
@@ -94,6 +99,7 @@ def with_systematic_errors(
     cameras : standard deviations of the cameras' poses, if neither the subject nor the answers contain them; None for
         exact ones
     shared : errors that points of one segment share, as the fit assumed them; None for none
+    smoothed : whether the fit averages neighbouring frames
     """
     body, channels, rate = subject.body, take.channels, 1.0 / take.dt
     shared = shared or SharedErrors.none(len(channels.column))
@@ -123,34 +129,40 @@ def with_systematic_errors(
     def errors_at(f: int) -> SystematicErrors:
         other_sensors = nothing if others is None else (others.pooled(f, half), others.pushes(f))
         near = weight[max(f - half, 0) : f + half + 1]
-        return systematic_errors(priors, layout, results[f].state, near.mean(axis=0), noise, shared, *other_sensors)
+        assumed = 1.0 / np.maximum(near.max(axis=0), 1e-12)
+        return systematic_errors(
+            priors, layout, results[f].state, near.mean(axis=0), assumed, noise, shared, *other_sensors,
+            averaged=2 * half + 1 if smoothed else 0,
+        )  # fmt: skip
 
     few = {f: errors_at(f) for f in sampled.tolist()}
     shapes = [answer(list(few), [errors.alone for errors in few.values()]) for answer in answers]
+    parameters = [(len(priors.root), priors.parameters), *((s.factors.shape[2], s.parameters) for s in shapes)]
     drift_times = [noise.drift_time] if others is None or np.any(noise.drift > 0.0) else []
     drift_times += [] if others is None else others.drift_times
-    kept = _KeyFrames.of(few, shapes, len(results), rate, min(drift_times, default=np.inf))
+    kept = _KeyFrames.of(few, shapes, len(results), rate, min(drift_times, default=np.inf), parameters)
 
-    def variances() -> Iterator[tuple[NDArray, NDArray]]:
-        """Of every frame's degrees of freedom and joints: interpolated between key frames two or more frames apart."""
+    def variances() -> Iterator[tuple[NDArray, ...]]:
+        """Of every frame's degrees of freedom and joints, and white shares of the fit's own, between key frames."""
         keys = _computed(len(results), rate)
-        before, now = (np.zeros(0), np.zeros(0)), (np.zeros(0), np.zeros(0))
+        before, now = tuple[NDArray, ...](), tuple[NDArray, ...]()
         for last, f in pairwise([-1, *keys.tolist()]):
             errors = few.pop(f, None) or errors_at(f)
             kept.add(f, errors, shapes)
-            before, now = now, (np.maximum(np.diag(errors.dofs), 0.0), errors.joints)
+            dofs = np.maximum(np.diag(errors.dofs), 0.0)
+            before, now = now, (dofs, errors.joints, errors.white_dofs, errors.white_joints)
             for k in range(last + 1, f):
                 share = (k - last) / (f - last)
-                yield (1.0 - share) * before[0] + share * now[0], (1.0 - share) * before[1] + share * now[1]
+                yield tuple((1.0 - share) * a + share * b for a, b in zip(before, now))
             yield now
 
     def inflated() -> Iterator[FrameResult]:
-        for f, (result, (dofs, joints)) in enumerate(zip(results, variances())):
+        for f, (result, (dofs, joints, white_dofs, white_joints)) in enumerate(zip(results, variances())):
             for shape in shapes:
                 dofs, joints = (variance + added for variance, added in zip((dofs, joints), shape.at(f)))
             yield replace(
-                result, dof_std=np.sqrt(np.square(result.dof_std) + dofs),
-                joint_std=np.sqrt(np.square(result.joint_std) + joints),
+                result, dof_std=np.sqrt(white_dofs * np.square(result.dof_std) + dofs),
+                joint_std=np.sqrt(white_joints * np.square(result.joint_std) + joints),
             )  # fmt: skip
 
     return inflated(), noise, kept.errors
@@ -188,15 +200,20 @@ class _KeyFrames:
     @classmethod
     def of(
         cls, few: Mapping[int, SystematicErrors], shapes: Sequence[ShapeErrors], frames: int, rate: float,
-        drift_time: float,
+        drift_time: float, parameters: Sequence[tuple[int, ParameterErrors | None]],
     ) -> _KeyFrames:  # fmt: skip
-        """For so many frames, with directions from the errors of a few."""
+        """For so many frames, with directions from the errors of a few; (count, parameters) of the last columns."""
         all_constant = np.stack([_with_shapes(errors, shapes, f) for f, errors in few.items()])
         all_drift = np.stack([errors.drift for errors in few.values()])
         constant, drift = _directions(all_constant), _directions(all_drift)
         keys = key_frames(frames, rate)
         s, d = (room((len(keys), all_drift.shape[1], v.shape[1]), np.float16) for v in (constant, drift))
-        return cls(LastingErrors(keys, s, d, drift_time), constant, drift)
+        first, known = len(constant) - sum(count for count, _ in parameters), None
+        for count, errors in parameters:
+            if errors is not None:
+                known = replace(errors, directions=constant[first : first + count].T @ errors.directions)
+            first += count
+        return cls(LastingErrors(keys, s, d, drift_time, known), constant, drift)
 
     def add(self, frame: int, errors: SystematicErrors, shapes: Sequence[ShapeErrors]) -> None:
         """Keep those of a frame, if it is a key frame."""
@@ -241,17 +258,27 @@ class KeypointPriors:
     cameras : parameters of cameras' poses, the last ones; None for exact cameras
     covariance : (p, p) of shape and cameras
     closing : derivatives of the body's closures by the shape; errors of closures themselves are systematic
+    fit : of the shape; None for an exact one
     """
 
     moves: PointMoves | None
     cameras: CameraExtrinsics | None
     covariance: NDArray
     closing: ClosureMoves | None = None
+    fit: SubjectFit | None = None
 
     @cached_property
     def root(self) -> NDArray:
         """(p, p) of which the product with its own transpose is the covariance."""
         return square_root(self.covariance)
+
+    @property
+    def parameters(self) -> ParameterErrors | None:
+        """What the fit of the shape knows, and of the cameras that it contained; None for an exact shape."""
+        if self.fit is None:
+            return None
+        known = np.arange(min(len(self.covariance), len(self.fit.names)))
+        return parameter_errors(self.fit, self.root[: len(known)], known)
 
     @classmethod
     def of(cls, subject: Subject, channels: Channels, errors: CameraErrors | None) -> KeypointPriors:
@@ -263,17 +290,17 @@ class KeypointPriors:
             if cameras is not None and same_cameras(cameras.rig, channels.rig):
                 shift = np.zeros(len(covariance))  # the subject's fit moved the cameras, the motion's fit did not
                 shift[-len(cameras.names) :] = subject.fit.mean[-len(cameras.names) :]
-                return cls(moves, cameras, covariance + np.outer(shift, shift), closing)
+                return cls(moves, cameras, covariance + np.outer(shift, shift), closing, subject.fit)
             if cameras is not None:  # cameras of another take
                 covariance = covariance[: -len(cameras.names), : -len(cameras.names)]
         else:
             moves, covariance, closing = None, np.zeros((0, 0)), None
         if errors is None or not len(channels.camera):
-            return cls(moves, None, covariance, closing)
+            return cls(moves, None, covariance, closing, subject.fit)
         used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
         cameras = CameraExtrinsics.of(errors, channels.rig, used)
         whole = block_diagonal(covariance, np.linalg.inv(cameras.information))
-        return cls(moves, cameras, whole, closing)
+        return cls(moves, cameras, whole, closing, subject.fit)
 
     def columns(self, layout: Layout, rows: Rows, tree: KinematicTree, frames: NDArray) -> tuple[NDArray, NDArray]:
         """(N, p) whitened derivatives of rows, and (S, 3, p) of joint centres; frames (S, 12) of the segments."""
@@ -323,8 +350,8 @@ def pixel_information(take: SmoothTake, weight: NDArray, shared: SharedErrors | 
 
 
 def systematic_errors(
-    priors: KeypointPriors, layout: Layout, state: BodyState, weight: NDArray,
-    noise: VarianceComponents, shared: SharedErrors, other_information: NDArray, others: Pushes,
+    priors: KeypointPriors, layout: Layout, state: BodyState, weight: NDArray, assumed: NDArray,
+    noise: VarianceComponents, shared: SharedErrors, other_information: NDArray, others: Pushes, *, averaged: int = 0,
 ) -> SystematicErrors:  # fmt: skip
     """Covariance of one frame's pose from bias, drift, shared biases of sensors and shape.
 
@@ -332,10 +359,12 @@ def systematic_errors(
     ----------
     priors : shape and cameras with their covariance
     weight : (N,) [1/px²] of every channel in the fit, robust factor included; 0 where undetected
+    assumed : (N,) [px²] variance of a channel's errors, all of which the fit counts as white
     noise : of the detectors
     shared : share of a channel's errors, of jitter and drift alike, that its group shares
     other_information : (n, n) of all sensors but the keypoints
     others : of these
+    averaged : int, frames that the fit averages; 0 for a fit of each frame, whose variance is left as it is
     """
     body, channels, tree = layout.body, layout.channels, layout.body.tree
     rows, J, pushed = pixel_columns(layout, state, weight, shared)
@@ -373,6 +402,29 @@ def systematic_errors(
     joints = np.sum(product(moved, dofs) * moved, axis=-1) + np.sum(product(whole, Sigma) * whole, axis=-1)
     by_shape = product(response, priors.root)
     shape = product(by_shape, by_shape.T)
+    surplus = pushed_by(np.sqrt(np.maximum(assumed - np.square(noise.white), 0.0)))
+    surplus = gram(surplus, surplus) + others.surplus
+    white = _white_shares(
+        body, state, averaged * (gram(J, pushed) + other_information), averaged * surplus, moved
+    )  # fmt: skip
     return SystematicErrors(
-        dofs + shape, np.maximum(joints, 0.0), alone, np.concatenate([constant, by_shape], axis=1), drift
+        dofs + shape, np.maximum(joints, 0.0), alone, np.concatenate([constant, by_shape], axis=1), drift, *white
     )
+
+
+def _white_shares(
+    body: Body, state: BodyState, information: NDArray, surplus: NDArray, moved: NDArray
+) -> tuple[NDArray, NDArray]:
+    """(n,), (S, 3) shares of the variances of degrees of freedom and joints that white errors cause.
+
+    Parameters
+    ----------
+    information, surplus : (n, n) of the frames that the fit averages together; and what of it are no white errors
+    moved : (S, 3, n) [m, m/rad] derivatives of the joints
+    """
+    whole = covariance_alone(body, state, information)
+    less = _BY_MEASUREMENTS * product(product(whole, surplus), whole)
+    dofs = np.diag(less) / np.maximum(np.diag(whole), 1e-30)
+    joints = np.sum(product(moved, less) * moved, axis=-1)
+    joints /= np.maximum(np.sum(product(moved, whole) * moved, axis=-1), 1e-30)
+    return 1.0 - np.clip(dofs, 0.0, 1.0), 1.0 - np.clip(joints, 0.0, 1.0)

@@ -146,7 +146,7 @@ def motion_of(
     elsewhere = any(one.cameras is not None for one in found)
     last, detectors, lasting = with_systematic_errors(
         results, subject, take, weight, noise_of_others, answers,
-        cameras=None if elsewhere else settings.camera_errors, shared=shared,
+        cameras=None if elsewhere else settings.camera_errors, shared=shared, smoothed=smooth,
     )  # fmt: skip
     if channels.sources:
         provenance["detector noise"] = detectors.summary("px", 2, channels.sources)

@@ -7,9 +7,9 @@ import pytest
 from tests.exporters.report.test_page import own
 from tests.exporters.synthetic import smooth_motion
 
-from kinefit.exporters.report.angles import MAX_STD_DEG, all_ranges, extremes, ranges_of, ranges_table
+from kinefit.exporters.report.angles import MAX_STD_DEG, all_ranges, changes, extremes, ranges_of, ranges_table
 from kinefit.exporters.tables import NAMES, Curve, curves
-from kinefit.lasting_errors import LastingErrors
+from kinefit.lasting_errors import LastingErrors, ParameterErrors
 from kinefit.motion import BRIEF_S
 
 RATE = 50.0
@@ -107,3 +107,37 @@ def test_ranges_of_all_angles_by_side():
     assert found["knee_angle"]["left"].span[0] == pytest.approx(np.ptp(knee.values))
     blind = replace(motion, quality=np.zeros(len(motion)))
     assert all(one is None for sides in ranges_of(blind).values() for one in sides.values())
+
+
+def test_a_change_lacks_the_errors_that_two_takes_of_a_person_share():
+    motion = smooth_motion(40)
+    motion = replace(motion, quality=np.ones(40), dof_std=np.full_like(motion.dof_std, np.radians(5.0)))
+    n = motion.dof_std.shape[1]
+    constant = np.radians(3.0) * np.ones((1, n, 1)) * np.linspace(-1.0, 1.0, 40)[:, None, None]
+    constant = np.concatenate([constant, np.zeros((40, n, 1))], axis=2)  # of the thigh's length, and of the shank's
+
+    def of(values, names=("thigh", "shank")):
+        """The thigh as the prior has it, the shank measured."""
+        covariance, directions = np.diag([1.0, 1e-6]), np.diag([1.0, 1e-3])
+        known = ParameterErrors(names, np.array(values), covariance, np.eye(2), directions)
+        return replace(motion, lasting=LastingErrors(np.arange(40), constant, np.zeros((40, n, 0)), 0.3, known))
+
+    before, after = of([0.0, 0.4]), of([0.0, 0.4])
+    key = ("knee_angle", "left")
+    alone = changes(before, replace(after, lasting=replace(after.lasting, parameters=None)))[key]
+    assert alone.change[1] == pytest.approx(np.hypot(alone.before.span[1], alone.after.span[1]))
+    low, high = alone.before.ends
+    constant_deg = 3.0 * abs(high - low) * 2 / 39
+    shared = changes(before, after)[key]
+    assert shared.change == (0.0, pytest.approx((alone.change[1] ** 2 - 8 * constant_deg**2) ** 0.5))
+    assert changes(before, of([0.0, -1.0]))[key].change[1] == pytest.approx(alone.change[1])  # somebody else
+    assert changes(before, of([0.0, 0.4], ("l", "r")))[key].change[1] == pytest.approx(alone.change[1])
+    wider = np.array(motion.angles)
+    column = list(motion.body.tree.coordinates).index("knee_angle_l")
+    wider[:, column] *= 2.0
+    more = changes(before, replace(after, angles=wider))[key]
+    assert more.change[0] == pytest.approx(shared.before.span[0]) and more.is_clear == (more.change[0] > more.change[1])
+    blind = np.array(motion.dof_std)
+    blind[:, 6 + column] = np.inf
+    unseen = changes(before, replace(after, dof_std=blind))[key]
+    assert unseen.change is None and unseen.after is None and not unseen.is_clear

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.cycles import PERCENT, Cycles, Norms, normalised
 from kinefit.exporters.tables import DIGITS, FINGER_JOINTS, NAMES, Curve, curves, spoken
+from kinefit.lasting_errors import common
 from kinefit.motion import Motion
 
 _COLOURS = {"left": p.LEFT_COLOUR, "right": p.RIGHT_COLOUR, "": p.CENTRE_COLOUR}
@@ -234,7 +235,7 @@ class RangeChange:
     ----------
     before, after : None where it was not observed
     change : range after minus range before, with two standard deviations [deg]; None where one was not observed.
-        The takes count as independent.
+        What the prior leaves open of lengths, landmarks and cameras is in both takes of a person the same error.
     """
 
     before: Extremes | None
@@ -249,14 +250,30 @@ class RangeChange:
 
 def changes(before: Motion, after: Motion) -> dict[tuple[str, str], RangeChange]:
     """{coordinate without its side, side: how its range changed} of all angles of the first motion."""
-    later = ranges_of(after)
+    later, shared = ranges_of(after), None
+    if before.lasting is not None and after.lasting is not None:
+        shared = common(before.lasting, after.lasting)
     found = {(stem, side): one for stem, of in ranges_of(before).items() for side, one in of.items()}
     out = {}
     for (stem, side), a in found.items():
         b = later.get(stem, {}).get(side)
-        change = (b.span[0] - a.span[0], float(np.hypot(a.span[1], b.span[1]))) if a and b else None
+        change = None
+        if a and b:
+            alike = 4.0 * np.degrees(np.degrees(_covariance(shared, before, a, after, b)))
+            change = b.span[0] - a.span[0], float(np.sqrt(max(a.span[1] ** 2 + b.span[1] ** 2 - 2.0 * alike, 0.0)))
         out[stem, side] = RangeChange(a, b, change)
     return out
+
+
+def _covariance(shared: NDArray | None, before: Motion, a: Extremes, after: Motion, b: Extremes) -> float:
+    """[rad²] of the ranges of one angle in two takes."""
+    if shared is None or a.coordinate is None or b.coordinate is None:
+        return 0.0
+    first, second = (
+        np.subtract(*motion.lasting.at(one.ends[::-1], np.array([one.coordinate] * 2))[0])  # type: ignore[union-attr]
+        for motion, one in ((before, a), (after, b))
+    )
+    return float(first @ shared @ second)
 
 
 def ranges_table(motion: Motion) -> p.Html:

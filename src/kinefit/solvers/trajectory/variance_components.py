@@ -61,6 +61,11 @@ class VarianceComponents:
         return np.asarray(np.sqrt(self.drift_share) * self.drift)
 
     @property
+    def white(self) -> NDArray:
+        """(C,) standard deviation of what averages out over these frames: the jitter, and the rest of the drift."""
+        return np.asarray(np.sqrt(self.jitter**2 + (1.0 - self.drift_share) * self.drift**2))
+
+    @property
     def systematic(self) -> NDArray:
         """(C,) standard deviation of systematic errors, which do not average out over neighbouring frames."""
         return np.asarray(np.sqrt(self.bias**2 + self.drift**2 + self.bias_error**2))
