@@ -219,8 +219,8 @@ class _KeyFrames:
         """Keep those of a frame, if it is a key frame."""
         k = int(np.searchsorted(self.errors.frames, frame))
         if k < len(self.errors.frames) and self.errors.frames[k] == frame:
-            self.errors.constant[k] = _with_shapes(errors, shapes, frame) @ self.constant
-            self.errors.drift[k] = errors.drift @ self.drift
+            self.errors.constant[k] = product(_with_shapes(errors, shapes, frame), self.constant)
+            self.errors.drift[k] = product(errors.drift, self.drift)
 
 
 def _with_shapes(errors: SystematicErrors, shapes: Sequence[ShapeErrors], frame: int) -> NDArray:
@@ -232,7 +232,7 @@ def _directions(factors: NDArray) -> NDArray:
     """(k, K) orthonormal directions that hold most of factors (F, n, k), every coordinate alike; all where few."""
     std = np.sqrt(np.square(factors).sum(axis=2).mean(axis=0))
     rows = (factors / np.maximum(std, 1e-12)[:, None]).reshape(std.size * len(factors), -1)
-    return np.asarray(np.linalg.eigh(gram(rows, rows))[1][:, ::-1][:, :_DIRECTIONS])
+    return np.ascontiguousarray(np.linalg.eigh(gram(rows, rows))[1][:, ::-1][:, :_DIRECTIONS])
 
 
 def _residuals(take: SmoothTake) -> NDArray:
