@@ -1,0 +1,226 @@
+"""What other distributions add to kinefit by entry points: records in tables of names, beside kinefit's own.
+
+A record is imported when its name is used. Kinds of sensors are in the group `kinefit.sensors`, formats of motions in
+`kinefit.exporters`, formats of files that are read in `kinefit.readers`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from kinefit.errors import KinefitError, PluginError, check_choice
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """A record of another distribution, as its entry point names it; `str` names both in messages."""
+
+    point: EntryPoint
+
+    @property
+    def distribution(self) -> str:
+        """Name for `pip`."""
+        return self.point.dist.name  # type: ignore[union-attr]
+
+    @property
+    def version(self) -> str:
+        """Name and version of the distribution."""
+        return f"{self.distribution} {self.point.dist.version}"  # type: ignore[union-attr]
+
+    @property
+    def package(self) -> str:
+        """Package or module of the highest level in which the record is."""
+        return self.point.module.partition(".")[0]
+
+    @property
+    def code_digest(self) -> bytes:
+        """Digest of its version and, once it is imported, of its source."""
+        digest, module = hashlib.sha256(self.version.encode()), sys.modules.get(self.point.module)
+        file = Path(getattr(module, "__file__", None) or os.devnull)
+        is_package = hasattr(sys.modules.get(self.package), "__path__")
+        for source in sorted(file.parent.rglob("*.py")) if is_package else [file]:
+            digest.update(source.read_bytes())
+        return digest.digest()
+
+    def __str__(self) -> str:
+        return f"the plug-in {self.version} (entry point '{self.point.name}' of {self.point.group})"
+
+    def error(self, problem: str, remedy: str | None = None, **more: Any) -> PluginError:
+        """An error that names the plug-in; `problem` follows its name."""
+        fix = f"Tell its author; without {self.distribution} (pip uninstall {self.distribution}) remove what names it."
+        return PluginError(f"{self} {problem}", remedy=remedy or fix, **more)
+
+    def raised(self, error: BaseException) -> str:
+        """What it raised, and the line of its code; "" if none of its code was running."""
+        found = ""
+        for frame, line in traceback.walk_tb(error.__traceback__):
+            if frame.f_globals.get("__name__", "").partition(".")[0] == self.package:
+                code = frame.f_code
+                found = f"in {code.co_qualname} ({Path(code.co_filename).name}, line {line})"
+        return found and f"raised {type(error).__name__} {found}: {error}"
+
+    def load(self) -> Any:
+        """What its entry point names, imported now.
+
+        Raises
+        ------
+        PluginError
+            It cannot be imported, or needs a package which is not installed.
+        """
+        try:
+            return self.point.load()
+        except Exception as error:
+            missing = (getattr(error, "name", None) or "").partition(".")[0]
+            if isinstance(error, ModuleNotFoundError) and missing != self.package:
+                remedy = f"Install it: pip install {missing}."
+                raise self.error(f"needs the package '{missing}', which is not installed", remedy) from error
+            raised = self.raised(error) or f"raised {type(error).__name__}: {error}"
+            remedy = f"Install it again: pip install --force-reinstall {self.distribution}."
+            raise self.error(f"cannot be imported: it {raised}", remedy) from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extension:
+    """Base of the records that plug-ins can add.
+
+    Parameters
+    ----------
+    plugin : the entry point of another distribution, set when it is loaded; None for a record of kinefit
+    """
+
+    plugin: Plugin | None = None
+
+    def fault(self, name: str) -> str:
+        """What is wrong with a record of this name of a plug-in, after the plug-in's name; "" if nothing."""
+        return ""
+
+    def call(self, part: str, *args: Any, valid: Callable[[Any], bool], what: str, **options: Any) -> Any:
+        """Result of a part of the record; `valid` of it is True if it is `what` the part must return.
+
+        Raises
+        ------
+        PluginError
+            A part of a plug-in raised something else than a KinefitError, or returned something else.
+        """
+        try:
+            result = getattr(self, part)(*args, **options)
+            result = list(result) if isinstance(result, Iterator) else result
+        except KinefitError:
+            raise
+        except Exception as error:
+            if self.plugin is None:
+                raise
+            raised = self.plugin.raised(error) or f"raised {type(error).__name__}: {error}"
+            raise self.plugin.error(raised, place=f"`{part}`") from error
+        if self.plugin is not None and not valid(result):
+            raise self.plugin.error(f"returned a {type(result).__name__} from `{part}`, not {what}", place=f"`{part}`")
+        return result
+
+
+_Record = TypeVar("_Record", bound=Extension)
+
+
+@dataclass(frozen=True, eq=False)
+class Extensions(Generic[_Record]):
+    """Records of one class by name: kinefit's own, and those of plug-ins.
+
+    Parameters
+    ----------
+    group : of entry points, `name = "module:record"`
+    record : class
+    what : what has such a name, for messages: "keypoint format"
+    built_in : {name: record, or "module:record", which is imported when it is used}
+    prefix : with which names of the entry points begin
+    """
+
+    group: str
+    record: type[_Record]
+    what: str
+    built_in: Mapping[str, _Record | str] = field(default_factory=dict)
+    prefix: str = ""
+
+    def plugins(self, name: str) -> tuple[Plugin, ...]:
+        """The plug-ins of a name; none of them is imported."""
+        return installed().get((self.group, self.prefix + name), ())
+
+    def names(self) -> tuple[str, ...]:
+        """All names, kinefit's own first."""
+        points = (name for group, name in installed() if group == self.group and name.startswith(self.prefix))
+        return tuple(dict.fromkeys([*self.built_in, *(name.removeprefix(self.prefix) for name in points)]))
+
+    def refuse_shadows(self, name: str, others: Iterable[str] = ()) -> None:
+        """Refuse a plug-in with a name of kinefit, which `others` may be too, or of another plug-in.
+
+        Raises
+        ------
+        PluginError
+            With the names of both.
+        """
+        found = self.plugins(name)
+        if found and name in (*others, *self.built_in):
+            remedy = f"Remove it (pip uninstall {found[0].distribution}), or ask its author for another name."
+            raise found[0].error(f"has the name of kinefit's own {self.what} '{name}'", remedy)
+        if len(found) > 1:
+            remedy = f"Remove one: pip uninstall {found[1].distribution}."
+            raise found[0].error(f"has the same name as {found[1].version}", remedy)
+
+    def check(self, name: str, error: type[KinefitError], *, valid: Iterable[str] = (), **more: Any) -> None:
+        """Raise an error for a name that neither kinefit nor a plug-in has, nor is one of `valid`."""
+        check_choice(self.what, name, (*self.names(), *valid), error, **{"remedy": install(self.what)} | more)
+
+    def get(self, name: str) -> _Record:
+        """The record of a name that exists, imported now.
+
+        Raises
+        ------
+        PluginError
+            As `refuse_shadows`; a plug-in that cannot be imported, or whose record is wrong.
+        """
+        record: _Record = _record(self, name)
+        return record
+
+
+def install(what: str, distribution: str = "the package that adds it") -> str:
+    """Remedy for a name that is not known: `what` has it."""
+    return f"Correct the {what}, or install its plug-in: {sys.executable} -m pip install {distribution}."
+
+
+@cache
+def installed() -> dict[tuple[str, str], tuple[Plugin, ...]]:
+    """{(group, name): plug-ins} of the entry points of all distributions; none of them is imported."""
+    from importlib.metadata import entry_points  # 0.03 s
+
+    found: dict[tuple[str, str], tuple[Plugin, ...]] = {}
+    ours = (point for point in entry_points() if point.group.startswith("kinefit."))
+    for point in sorted(ours, key=lambda point: (point.name, point.value)):
+        found[point.group, point.name] = (*found.get((point.group, point.name), ()), Plugin(point))
+    return found
+
+
+@cache
+def _record(of: Extensions[Any], name: str) -> Any:
+    of.refuse_shadows(name)
+    if name in of.built_in:
+        own = of.built_in[name]
+        if not isinstance(own, str):
+            return own
+        module, _, attribute = own.partition(":")
+        return getattr(import_module(module), attribute)
+    plugin = of.plugins(name)[0]
+    record = plugin.load()
+    fault = record.fault(name) if isinstance(record, of.record) else f"is no {of.record.__name__}"
+    if fault:
+        raise plugin.error(fault)
+    return replace(record, plugin=plugin)
