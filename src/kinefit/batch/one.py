@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from kinefit._files import regular
+from kinefit.batch.formats import DEFAULT_FORMATS, FORMATS, check_formats
 from kinefit.batch.processes import progress
-from kinefit.batch.results import DEFAULT_FORMATS, Step, write_overlays, write_results
+from kinefit.batch.results import Step, write_overlays, write_results
 from kinefit.batch.summary import DONE, RECORD, Range, Row, failed, write_people_report
 from kinefit.errors import KinefitError, TakeError, printable
 from kinefit.findings import of_provenance
@@ -30,7 +31,7 @@ class Choices:
 
     Parameters
     ----------
-    formats : of `results.NAMES`
+    formats : names of `FORMATS`
     overlays : bool, whether overlay videos are written
     overlay_skin : bool, whether they show the person's skin, too
     report : bool, whether report.html is written
@@ -83,11 +84,12 @@ def asked_take(path: Path, choices: Choices) -> Take:
     Raises
     ------
     KinefitError
-        The take or the named person is invalid.
+        The take or the named person is invalid, or a format cannot be written.
     """
     from kinefit.readers.take.checks import check_enough, check_take
     from kinefit.readers.take.file import read_take
 
+    check_formats(choices.formats)
     take = read_take(path)
     take = replace(take, hide_faces=take.hide_faces or choices.hide_faces)
     if choices.person is not None:
@@ -236,7 +238,9 @@ def work(job: TakeJob) -> tuple[Row, ...]:
             take = asked_take(job.take, job.choices)
         keys = ("subject", "visit", "date", "movement")
         start = msgspec.structs.replace(start, **{key: take.session.stated.get(key, "") for key in keys})
-        key = key_of(take, **asdict(replace(job.choices, restart=False)))
+        plugins = [plugin for name in job.choices.formats if (plugin := FORMATS.get(name).plugin) is not None]
+        exporters = [plugin.code_digest for plugin in plugins]
+        key = key_of(take, **asdict(replace(job.choices, restart=False)), exporters=exporters)
         complete = not is_uncalibrated(last_found(take))  # whoever deletes found cameras wants others
     except KinefitError as error:
         return (failed(start, str(error)),)

@@ -26,7 +26,6 @@ class FileFormat(Extension):
 
     Parameters
     ----------
-    summary : what it is, in a line
     suffixes : of such files, in lower case, ".csv"
     read : of keypoints (path, *, camera, rate) -> `Keypoints` of this camera and rate [Hz], in pixels of the file; of
         markers (path, *, unit) -> `Markers` [m], with the unit that the user states, or None; of a calibration
@@ -36,7 +35,6 @@ class FileFormat(Extension):
     has_all_cameras : whether a file of keypoints is of several cameras
     """
 
-    summary: str
     suffixes: tuple[str, ...]
     read: Callable[..., Any]
     recognise: Callable[[Path], bool] | None = None
@@ -67,10 +65,10 @@ class FileFormats(Extensions[FileFormat]):
                 yield name, self.get(name)
             except PluginError as error:
                 faults.append(error)
-        for (group, name), plugins in installed().items():
-            if group == GROUP and not name.startswith(_KINDS):
-                kinds = ", ".join(f"{kind}{name}" for kind in _KINDS)
-                faults.append(plugins[0].error("has a name that states no kind of file", f"Its author names it {kinds}."))
+        for name, plugins in installed(GROUP).items():
+            if not name.startswith(_KINDS):
+                remedy = f"Its author writes {', '.join(f'{kind}{name}' for kind in _KINDS)}."
+                faults.append(plugins[0].error("has a name that states no kind of file", remedy))
 
     def name_of(self, path: Path, *, by_suffix: bool = False) -> str | None:
         """Name of the format that recognises a file, kinefit's own asked first; None if none does.

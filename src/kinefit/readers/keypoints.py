@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit._files import read_bytes, read_npy, read_table
+from kinefit._files import npy_header, read_bytes, read_npy, read_table
 from kinefit._mapped import kept
 from kinefit.errors import FileError, ObservationError, choices, located, names_file
 from kinefit.observations import Keypoints
@@ -22,6 +22,7 @@ from kinefit.readers import keypoint_sets
 from kinefit.readers.formats import KEYPOINTS, FileFormat
 from kinefit.readers.keypoint_sets import (
     FACE_POINTS,
+    FACE_SET,
     HAND_POINTS,
     KEYPOINT_SETS,
     MEDIAPIPE_SETS,
@@ -144,13 +145,12 @@ def read_mediapipe(
     """
     path = Path(path)
     data = read_npy(path, remedy="Write it by numpy.save.")
-    sets = {(len(KEYPOINT_SETS[name]), 3): name for name in MEDIAPIPE_SETS}
-    sets |= dict.fromkeys(((n, 3) for n in FACE_POINTS), "MEDIAPIPE_478")
-    if data.dtype.kind not in "fiu" or data.shape[1:] not in sets:
+    keypoint_set = mediapipe_set((data.shape, data.dtype))
+    if keypoint_set is None:
         remedy = "Give x, y [px], visibility: (frames, 33, 3), with hands (frames, 75, 3), of a face (frames, 478, 3)."
         raise ObservationError(f"landmarks have shape {data.shape}", remedy=remedy)
     data, start = cut_frames(data, frames, path)
-    data, keypoint_set = np.array(data, dtype=float), sets[data.shape[1:]]
+    data = np.array(data, dtype=float)
     names = KEYPOINT_SETS[keypoint_set]
     pose = len(KEYPOINT_SETS["MEDIAPIPE_33"])
     for part in np.split(data, range(pose, len(names), HAND_POINTS) if len(names) < min(FACE_POINTS) else (), axis=1):
@@ -169,7 +169,15 @@ def read_mediapipe(
     return keypoint_record(data[:, None], camera, keypoint_set, rate, time_offset, start, path, image_frame)
 
 
+def mediapipe_set(header: tuple[tuple[int, ...], np.dtype] | None) -> str | None:
+    """Keypoint set of an array with this shape and type; None of another array, or of none."""
+    sets: dict[tuple[int, ...], str] = {(len(KEYPOINT_SETS[name]), 3): name for name in MEDIAPIPE_SETS}
+    sets |= dict.fromkeys(((n, 3) for n in FACE_POINTS), FACE_SET)
+    return sets.get(header[0][1:]) if header is not None and header[1].kind in "fiu" else None
+
+
 _CALISCOPE_HANDS = (100, 200)  # first indices of the right and of the left hand
+_MAX_HEADER_BYTES = 4096  # of a table of caliscope
 _GAPS, _PORTS = 20, 100  # indices for each that is there, and cameras, beyond which a table is damaged
 
 
@@ -273,6 +281,10 @@ def read_keypoints(
     return replace(record, points=points, time_offset=record.time_offset + time_offset)
 
 
+def _is_caliscope(path: Path) -> bool:
+    return path.suffix.lower() == ".csv" and b"sync_index" in read_bytes(path, _MAX_HEADER_BYTES)
+
+
 @names_file
 def _caliscope_camera(path: Path, *, camera: str, rate: float | None) -> Keypoints:
     ports, numbers = read_caliscope_csv(path, rate=rate), re.findall(r"\d+", camera)
@@ -354,8 +366,9 @@ OPENPOSE = FileFormat(
 )
 MEDIAPIPE = FileFormat(
     summary="MediaPipe Pose (Bazarevsky et al. 2020, BlazePose)", suffixes=(".npy",), read=read_mediapipe,
+    recognise=lambda path: mediapipe_set(npy_header(path)) is not None,
 )
 CALISCOPE = FileFormat(
     summary="the landmarks that Caliscope recorded", suffixes=(".csv",), read=_caliscope_camera,
-    recognise=lambda path: False, has_all_cameras=True,
+    recognise=_is_caliscope, has_all_cameras=True,
 )

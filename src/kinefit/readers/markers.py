@@ -67,12 +67,12 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
 
 
 def _is_c3d(path: Path) -> bool:
-    return read_bytes(path, 64)[1:2] == b"\x50" or path.suffix.lower() == ".c3d"
+    return path.suffix.lower() == ".c3d" or read_bytes(path, 64)[1:2] == b"\x50"
 
 
 def _is_trc(path: Path) -> bool:
     head = read_bytes(path, 64).lstrip(b"\xef\xbb\xbf \t\r\n").lower()
-    return head.startswith(b"pathfiletype") or path.suffix.lower() == ".trc"
+    return path.suffix.lower() == ".trc" or head.startswith(b"pathfiletype")
 
 
 def _metres(unit: str | None) -> float:

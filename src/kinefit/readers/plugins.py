@@ -6,6 +6,7 @@ A record is imported when its name is used. Kinds of sensors are in the group `k
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import sys
@@ -21,6 +22,10 @@ from kinefit.errors import KinefitError, PluginError, check_choice
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
+
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+PLUGIN_COMMENT = "of the plug-in "
+"""Begin of the comment that `kinefit init` writes beside the name of a plug-in; its distribution follows."""
 
 
 @dataclass(frozen=True)
@@ -97,10 +102,17 @@ class Extension:
 
     Parameters
     ----------
+    summary : what it is, in a line
     plugin : the entry point of another distribution, set when it is loaded; None for a record of kinefit
     """
 
+    summary: str
     plugin: Plugin | None = None
+
+    @property
+    def comment(self) -> str:
+        """What stands beside its name where `kinefit init` writes it."""
+        return self.summary if self.plugin is None else f"{PLUGIN_COMMENT}{self.plugin.version}: {self.summary}"
 
     def fault(self, name: str) -> str:
         """What is wrong with a record of this name of a plug-in, after the plug-in's name; "" if nothing."""
@@ -113,6 +125,8 @@ class Extension:
         ------
         PluginError
             A part of a plug-in raised something else than a KinefitError, or returned something else.
+        OSError
+            The disk is full.
         """
         try:
             result = getattr(self, part)(*args, **options)
@@ -120,7 +134,7 @@ class Extension:
         except KinefitError:
             raise
         except Exception as error:
-            if self.plugin is None:
+            if self.plugin is None or getattr(error, "errno", None) in _DISK_FULL:
                 raise
             raised = self.plugin.raised(error) or f"raised {type(error).__name__}: {error}"
             raise self.plugin.error(raised, place=f"`{part}`") from error
@@ -153,12 +167,12 @@ class Extensions(Generic[_Record]):
 
     def plugins(self, name: str) -> tuple[Plugin, ...]:
         """The plug-ins of a name; none of them is imported."""
-        return installed().get((self.group, self.prefix + name), ())
+        return installed(self.group).get(self.prefix + name, ())
 
     def names(self) -> tuple[str, ...]:
         """All names, kinefit's own first."""
-        points = (name for group, name in installed() if group == self.group and name.startswith(self.prefix))
-        return tuple(dict.fromkeys([*self.built_in, *(name.removeprefix(self.prefix) for name in points)]))
+        added = (point.removeprefix(self.prefix) for point in installed(self.group) if point.startswith(self.prefix))
+        return tuple(dict.fromkeys([*self.built_in, *added]))
 
     def refuse_shadows(self, name: str, others: Iterable[str] = ()) -> None:
         """Refuse a plug-in with a name of kinefit, which `others` may be too, or of another plug-in.
@@ -192,20 +206,20 @@ class Extensions(Generic[_Record]):
         return record
 
 
-def install(what: str, distribution: str = "the package that adds it") -> str:
-    """Remedy for a name that is not known: `what` has it."""
-    return f"Correct the {what}, or install its plug-in: {sys.executable} -m pip install {distribution}."
+def install(what: str, distribution: str = "its package") -> str:
+    """Remedy for the name of something that is not known."""
+    pip = f"{sys.executable} -m pip install {distribution}"
+    return f"Correct the name, or install the plug-in that adds this {what}: {pip}."
 
 
 @cache
-def installed() -> dict[tuple[str, str], tuple[Plugin, ...]]:
-    """{(group, name): plug-ins} of the entry points of all distributions; none of them is imported."""
+def installed(group: str) -> dict[str, tuple[Plugin, ...]]:
+    """{name: plug-ins} of the entry points of a group, of all distributions; none of them is imported."""
     from importlib.metadata import entry_points  # 0.03 s
 
-    found: dict[tuple[str, str], tuple[Plugin, ...]] = {}
-    ours = (point for point in entry_points() if point.group.startswith("kinefit."))
-    for point in sorted(ours, key=lambda point: (point.name, point.value)):
-        found[point.group, point.name] = (*found.get((point.group, point.name), ()), Plugin(point))
+    found: dict[str, tuple[Plugin, ...]] = {}
+    for point in sorted(entry_points(group=group), key=lambda point: (point.name, point.value)):
+        found[point.name] = (*found.get(point.name, ()), Plugin(point))
     return found
 
 

@@ -35,6 +35,8 @@ FORMATS = (
     "Theia3D XML, Vicon .xcp, MATLAB .mat, COLMAP text (cameras.txt and images.txt), Kalibr, MC-Calib, multical, "
     "transforms.json, MCAP of ROS 2"
 )
+SUFFIXES = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt", ".xcp", ".mat")
+"""Ends of the names of files in these formats."""
 MAX_CALIBRATION_BYTES = 2_000_000
 """Largest file of a calibration [bytes]; a camera takes about a thousand."""
 PAIRS = (("intrinsics", "extrinsics"), ("intri", "extri"))
@@ -222,8 +224,7 @@ def calibration_sources(path: Path) -> list[tuple[str, list[Path]]]:
 
 
 def _calibration_files(folder: Path) -> list[Path]:
-    endings = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt", ".xcp", ".mat")
-    files = sorted(file for file in folder.iterdir() if file.is_file() and file.name.lower().endswith(endings))
+    files = sorted(file for file in folder.iterdir() if file.is_file() and file.name.lower().endswith(SUFFIXES))
     tables = [file for file in files if file.suffix.lower() not in (".xcp", ".mat")]  # these have other uses, too
     return tables or files
 

@@ -19,7 +19,7 @@ from kinefit.readers.guess.names import trials
 from kinefit.readers.markers import read_markers
 from kinefit.readers.ros.images import Shown, mcap_rig, shown
 from kinefit.readers.take.entries import TABLES
-from kinefit.readers.take.kinds import Proposal, kind_names, kind_of, refuse_shadows
+from kinefit.readers.take.kinds import KINDS, Proposal
 
 _CALIBRATE = (
     "Calibrate with a board (kinefit calibrate board) or, if the cameras' intrinsics are known, from the person "
@@ -66,11 +66,13 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
         raise TakeError("no such folder", file=folder, remedy="Name the folder with videos, keypoints and calibration.")
     draft = Draft(folder, Path(beside).absolute() if beside else folder)
     files = guess_files.list_files(folder)
-    videos, markers = guess_files.find_videos(files, folder), guess_files.find_markers(files)
+    faults: list[str] = []
+    videos, markers = guess_files.find_videos(files, folder), guess_files.find_markers(files, faults)
     keypoints, remarks = guess_files.find_keypoints(files)
     recordings = guess_files.find_recordings(files)
-    for remark in remarks:
-        draft.note("keypoints", "open", remark)
+    for about, texts in (("markers", faults), ("keypoints", remarks)):
+        for text in texts:
+            draft.note(about, "open", text)
     _describe_kinds(draft, files)
     if not (videos or keypoints or markers or recordings or any(draft.tables.values())):
         raise TakeError(
@@ -91,10 +93,10 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
 
 def _describe_kinds(draft: Draft, files: Sequence[Path]) -> None:
     """Enter what kinds of sensors find among files; a plug-in that fails becomes a note."""
-    for table in kind_names():
+    for table in KINDS.names():
         try:
-            refuse_shadows(table, TABLES)
-            kind, valid = kind_of(table), lambda found: all(isinstance(one, Proposal) and one.entry for one in found)
+            KINDS.refuse_shadows(table, TABLES)
+            kind, valid = KINDS.get(table), lambda found: all(isinstance(one, Proposal) and one.entry for one in found)
             found = kind.call("propose", files, valid=valid, what="proposals with an entry") if kind.propose else []
         except PluginError as error:
             draft.note(table, "open", f"{error.problem}. {error.remedy or ''}".strip())
@@ -112,9 +114,12 @@ def _choose_calibration(
 ) -> CalibrationFile | None:
     """The calibration that most files fit; from the parent folder if there is none here; None without one."""
     videos = guess_files.find_videos(files, draft.folder)
-    found, singles, faults = guess_files.find_calibrations(files, videos, draft.folder)
+    remarks: list[str] = []
+    found, singles, faults = guess_files.find_calibrations(files, videos, draft.folder, remarks=remarks)
     if not found:
-        found = guess_files.find_calibrations(_above(draft.folder), videos, draft.folder)[0]
+        found = guess_files.find_calibrations(_above(draft.folder), videos, draft.folder, remarks=remarks)[0]
+    for remark in remarks:
+        draft.note("calibration", "open", remark)
     if not found and markers:
         draft.note("calibration", "open", f"none, so videos and keypoints are not used. {_CALIBRATE}")
         return None

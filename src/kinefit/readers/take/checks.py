@@ -12,9 +12,10 @@ from kinefit.errors import FileError, ObservationError, TakeError, choices, comm
 from kinefit.motion import UP_AXES
 from kinefit.observations.recordings import PersonChoice
 from kinefit.readers.depth.images import listed
+from kinefit.readers.formats import KEYPOINTS
 from kinefit.readers.keypoint_sets import FACE_SET
 from kinefit.readers.ros.recordings import inside
-from kinefit.readers.take.entries import SINGLE_TABLES, Take, keys_of
+from kinefit.readers.take.entries import NO_FILES, SINGLE_TABLES, Take, keys_of
 
 ONE_CAMERA = "keypoints of one camera do not give a person's distance; two cameras do, or one with depth or markers"
 

@@ -26,9 +26,9 @@ from kinefit.errors import (
     printable,
     shortened,
 )
-from kinefit.readers.formats import KEYPOINTS
-from kinefit.readers.guess.files import MARKERS, VIDEOS
-from kinefit.readers.plugins import install
+from kinefit.readers.formats import KEYPOINTS, MARKERS
+from kinefit.readers.guess.files import VIDEOS
+from kinefit.readers.plugins import PLUGIN_COMMENT, install
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
@@ -44,7 +44,6 @@ from kinefit.readers.take.entries import (
 from kinefit.readers.take.kinds import (
     BUILT_IN,
     KINDS,
-    PLUGIN_COMMENT,
     WrongEntryError,
 )
 
@@ -197,7 +196,7 @@ def find_take(path: str | PathLike[str], *, wanted: Sequence[str] = ("track",)) 
         what = first if there is None else f"Use the take file next to it: {command(*wanted, there)}."
         remedy = f"{what} For keypoints of this video alone: {command('detect', path)}"
         raise FileError("a video, not a take file", file=path, remedy=remedy)
-    if kind in MARKERS:
+    if any(kind in MARKERS.get(name).suffixes for name in MARKERS.built_in):
         raise FileError("a marker file, not a take file", file=path, remedy=f"Run: {command('markers', 'fit', path)}")
     if kind == ".npz":
         raise FileError("a motion, not a take file", file=path, remedy=f"Look at it: {command('view', path)}")

@@ -31,9 +31,6 @@ BUILT_IN = {
 }
 """{table of a take file: where its kind stands}, in the order in which they are read."""
 
-PLUGIN_COMMENT = "of the plug-in "
-"""Begin of the comment that `kinefit init` writes beside the name of a plug-in's table; its distribution follows."""
-
 
 class WrongEntryError(TakeError, ValueError):
     """Keys of an entry that do not agree."""
@@ -90,7 +87,6 @@ class SensorKind(Extension):
     Parameters
     ----------
     table : name of the table, "insole" for `[[insole]]`; that of the entry point
-    summary : what it is, in a line
     entry : subclass of `TakeEntry`, the keys of the table
     read : (entry, name of the sensor, `TakeCameras` of the take) -> `SensorRecording` of this name
     sensor : (entry, recording, body) -> `Sensor` of this name; default: frames are of a class that kinefit tracks, such
@@ -106,7 +102,6 @@ class SensorKind(Extension):
     """
 
     table: str
-    summary: str
     entry: type[TakeEntry]
     read: Callable[[Any, str, Any], SensorRecording]
     sensor: Callable[[Any, Any, Body], Any] | None = None
@@ -118,11 +113,6 @@ class SensorKind(Extension):
     shows_everybody: bool = False
     replaces_keypoints: bool = False
     records: tuple[type, ...] = ()
-
-    @property
-    def comment(self) -> str:
-        """What stands beside the table's name where `kinefit init` writes it."""
-        return self.summary if self.plugin is None else f"{PLUGIN_COMMENT}{self.plugin.version}: {self.summary}"
 
     def fault(self, name: str) -> str:
         """An entry of another class, or another table than `name`."""
