@@ -8,7 +8,7 @@ theirs in the entry point group `kinefit.sensors`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -167,5 +167,6 @@ def plugins_of(take: Any) -> list[Plugin]:
     records: list[Extension | None] = [*kinds_of(take)]
     records += [KEYPOINTS.get(entry.format) for entry in take.keypoints if entry.format in KEYPOINTS.names()]
     records += [MARKERS.recognised(entry.file) for entry in take.markers]
-    records += [] if take.calibration is None else [CALIBRATIONS.recognised(take.calibration.file)]
+    with suppress(PluginError):  # which reading the calibration raises, if kinefit itself cannot
+        records += [] if take.calibration is None else [CALIBRATIONS.recognised(take.calibration.file)]
     return list(dict.fromkeys(record.plugin for record in records if record is not None and record.plugin is not None))
