@@ -237,7 +237,7 @@ def test_a_reader_that_fails(here, recording, pair, words):
     with pytest.raises(PluginError, match=words) as caught:
         read_keypoints(file, format="dlc", camera="cam01", rate=30.0)
     assert re.search(READER, caught.value.problem) and Path(caught.value.file) == file
-    notes = [note.text for note in guess_take(recording.parent).notes if note.about == "keypoints"]
+    notes = [note.text for note in guess_take(recording.parent).notes if note.about == "files"]
     assert any(re.search(f"{READER} ", note) for note in notes)
 
 
@@ -254,7 +254,7 @@ def test_a_format_that_cannot_be_asked_stops_only_files_that_no_other_reads(here
         read_markers(tmp_path / "walk.lines")
     assert Path(caught.value.file) == tmp_path / "walk.lines"
     here(('return file.readline().startswith("scorer,")', "return 1"))
-    with pytest.raises(PluginError, match=f"{READER} returned a int from `recognise`, not True or False"):
+    with pytest.raises(PluginError, match=f"{READER} returned a int from `recognise`, not a bool"):
         read_keypoints(file, camera="cam01", rate=30.0)
     assert "[[keypoints]]" not in guess_take(recording.parent).text
 
@@ -263,7 +263,7 @@ def test_a_format_that_cannot_be_asked_stops_only_files_that_no_other_reads(here
     ("pair", "words"),
     [
         (("return lambda path: path", "return lambda path: 1 / 0 * path"), "ZeroDivisionError in .*lambda"),
-        (("    return Rig(tuple(", "    return list(("), "returned a list from `read`, not a Rig of cameras"),
+        (("    return Rig(tuple(", "    return list(("), "returned a list from `read`, not a Rig"),
         (("    return Rig(tuple(", "    return Rig((), *("), "raised TypeError|returned a Rig"),
     ],
 )

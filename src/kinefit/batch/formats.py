@@ -6,7 +6,7 @@ Other distributions name theirs in the entry point group `kinefit.exporters`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from kinefit.motion import Motion
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class MotionFormat(Extension):
     """A format in which motions are written.
 
@@ -37,7 +37,7 @@ class MotionFormat(Extension):
     up: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
     rest: tuple[str, ...] = ()
-    why: str = ""
+    why: str = field(default="", kw_only=True)
 
     @property
     def ending(self) -> str:
@@ -45,16 +45,9 @@ class MotionFormat(Extension):
         return Path(self.file).suffix
 
     def fault(self, name: str) -> str:
-        """A file without an ending or in a folder, no function, or values that are no texts."""
-        if not (isinstance(self.file, str) and self.ending and Path(self.file).name == self.file):
-            return f"has the file {self.file!r}, not a name with an ending such as 'motion.dae'"
-        if not callable(self.write):
-            return "has a `write` that is no function"
-        for key in OPTIONS:
-            values = getattr(self, key)
-            if not (isinstance(values, tuple) and all(isinstance(value, str) for value in values)):
-                return f"has {key} = {values!r}, not a tuple of texts"
-        return ""
+        """A file without an ending, or in a folder."""
+        named = self.ending and Path(self.file).name == self.file
+        return "" if named else f"has the file {self.file!r}, not a name with an ending such as 'motion.dae'"
 
 
 OPTIONS = ("unit", "up", "names", "rest")
@@ -67,20 +60,15 @@ _BVH, _HANIM = ((first, *(name for name in _JOINTS if name != first)) for first 
 _OPENSIM = "OpenSim files are in metres, y up, with the names of the body's coordinates"
 
 
-def _own(
-    name: str, file: str, summary: str, unit: tuple[str, ...] = (), up: tuple[str, ...] = (),
-    names: tuple[str, ...] = (), rest: tuple[str, ...] = (), why: str = "",
-) -> tuple[str, MotionFormat]:  # fmt: skip
-    """Name and record of a format that `exporters.write_NAME` writes."""
+def _own(name: str, file: str, summary: str, *choices: Any, why: str = "") -> tuple[str, MotionFormat]:
+    """Name and record of a format that `exporters.write_NAME` writes; choices of `OPTIONS`."""
 
     def write(motion: Motion, path: Path, **options: Any) -> None:
         from kinefit import exporters
 
         getattr(exporters, f"write_{name}")(motion.body if name == "osim" else motion, path, **options)
 
-    return name, MotionFormat(
-        file=file, summary=summary, write=write, unit=unit, up=up, names=names, rest=rest, why=why
-    )
+    return name, MotionFormat(summary, file, write, *choices, why=why)
 
 
 FORMATS = Extensions("kinefit.exporters", MotionFormat, "format", dict([
@@ -89,22 +77,22 @@ FORMATS = Extensions("kinefit.exporters", MotionFormat, "format", dict([
     _own("parquet", "tables", "the same tables as Parquet", _UNITS, _UPS, _JOINTS),
     _own("bvh", "motion.bvh", "animated skeleton for animation programs", ("cm", "m", "mm"), _Y_UPS, _BVH, _RESTS),
     _own("glb", "motion.glb", "animated figure for browsers and game engines", (), (), _JOINTS, _RESTS,
-         "GLB is in metres and y up by its specification"),
+         why="GLB is in metres and y up by its specification"),
     _own("usd", "motion.usdc", "animated figure for film and simulation programs", _UNITS, ("y", "z"), _JOINTS,
-         _RESTS, "USD supports only y and z up"),
+         _RESTS, why="USD supports only y and z up"),
     _own("c3d", "motion.c3d", "joint centres and landmarks for motion laboratories", ("mm", "cm", "m"), _UPS,
          _JOINTS),
-    _own("trc", "motion.trc", "landmarks over time for OpenSim", _UNITS, _Y_UPS, (), (),
-         "TRC has landmarks, with their H-Anim names"),
+    _own("trc", "motion.trc", "landmarks over time for OpenSim", _UNITS, _Y_UPS,
+         why="TRC has landmarks, with their H-Anim names"),
     _own("x3d", "motion.x3d", "animated H-Anim figure for browsers and archives", (), (), _HANIM, _RESTS,
-         "X3D is in metres and y up by its standard"),
-    _own("nwb", "motion.nwb", "joint centres with confidence for neuroscience", (), _UPS, _JOINTS, (),
-         "kinefit writes NWB in metres"),
-    _own("mcap", "motion.mcap", "joint states and transforms for ROS 2", (), _Z_UPS, _JOINTS, (), "ROS is in metres"),
-    _own("rrd", "motion.rrd", "joints, error bars and angles for the viewer of Rerun", (), _UPS, _JOINTS, (),
-         "kinefit writes RRD in metres"),
+         why="X3D is in metres and y up by its standard"),
+    _own("nwb", "motion.nwb", "joint centres with confidence for neuroscience", (), _UPS, _JOINTS,
+         why="kinefit writes NWB in metres"),
+    _own("mcap", "motion.mcap", "joint states and transforms for ROS 2", (), _Z_UPS, _JOINTS, why="ROS is in metres"),
+    _own("rrd", "motion.rrd", "joints, error bars and angles for the viewer of Rerun", (), _UPS, _JOINTS,
+         why="kinefit writes RRD in metres"),
     _own("jsonl", "motion.jsonl", "poses as JSON lines, as kinefit live sends them; for the Blender add-on", (), _UPS,
-         (), (), "JSON lines are in metres, with the names of the body's segments"),
+         why="JSON lines are in metres, with the names of the body's segments"),
     _own("mot", "motion.mot", "angles over time for OpenSim", why=_OPENSIM),
     _own("osim", "body.osim", "the fitted body for OpenSim", why=_OPENSIM),
 ]))  # fmt: skip

@@ -238,8 +238,7 @@ def work(job: TakeJob) -> tuple[Row, ...]:
             take = asked_take(job.take, job.choices)
         keys = ("subject", "visit", "date", "movement")
         start = msgspec.structs.replace(start, **{key: take.session.stated.get(key, "") for key in keys})
-        plugins = [plugin for name in job.choices.formats if (plugin := FORMATS.get(name).plugin) is not None]
-        exporters = [plugin.code_digest for plugin in plugins]
+        exporters = [plugin.code_digest for name in job.choices.formats for plugin in FORMATS.plugins(name)]
         key = key_of(take, **asdict(replace(job.choices, restart=False)), exporters=exporters)
         complete = not is_uncalibrated(last_found(take))  # whoever deletes found cameras wants others
     except KinefitError as error:

@@ -6,12 +6,12 @@ Other distributions name theirs in the entry point group `kinefit.readers`, as `
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kinefit.errors import PluginError
+from kinefit.errors import KinefitError, PluginError
 from kinefit.readers.plugins import Extension, Extensions, installed
 
 GROUP = "kinefit.readers"
@@ -20,7 +20,7 @@ GROUP = "kinefit.readers"
 _KINDS = ("keypoints.", "markers.", "calibration.")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class FileFormat(Extension):
     """A format of files that are read into keypoints, markers or a rig.
 
@@ -41,60 +41,46 @@ class FileFormat(Extension):
     has_all_cameras: bool = False
 
     def fault(self, name: str) -> str:
-        """Suffixes that are none, or parts that are no functions."""
-        plain = isinstance(self.suffixes, tuple) and all(isinstance(s, str) and s == s.lower() for s in self.suffixes)
-        if not plain or not all(suffix.startswith(".") for suffix in self.suffixes):
-            return f"has the suffixes {self.suffixes!r}, not a tuple such as ('.csv',)"
-        parts = [self.read] if self.recognise is None else [self.read, self.recognise]
-        return "" if all(map(callable, parts)) else "has a `read` or `recognise` that is no function"
-
-    def recognises(self, path: Path) -> bool:
-        """Whether a file is of this format."""
-        if self.recognise is None:
-            return path.suffix.lower() in self.suffixes
-        return self.call("recognise", path, valid=lambda found: isinstance(found, bool), what="True or False")
+        """Suffixes that no file has."""
+        wrong = [suffix for suffix in self.suffixes if suffix != Path(f"x{suffix}".lower()).suffix]
+        return f"has the suffixes {self.suffixes!r}, not a tuple such as ('.csv',)" if wrong else ""
 
 
 class FileFormats(Extensions[FileFormat]):
     """The formats of one kind of file."""
 
-    def _usable(self, faults: list[PluginError]) -> Iterator[tuple[str, FileFormat]]:
-        """All formats that can be imported, kinefit's own first; errors of the others are added to `faults`."""
-        for name in self.names():
-            try:
-                yield name, self.get(name)
-            except PluginError as error:
-                faults.append(error)
-        for name, plugins in installed(GROUP).items():
-            if not name.startswith(_KINDS):
-                remedy = f"Its author writes {', '.join(f'{kind}{name}' for kind in _KINDS)}."
-                faults.append(plugins[0].error("has a name that states no kind of file", remedy))
-
-    def name_of(self, path: Path, *, by_suffix: bool = False) -> str | None:
+    def name_of(self, path: Path, faults: list[KinefitError] | None = None) -> str | None:
         """Name of the format that recognises a file, kinefit's own asked first; None if none does.
 
-        `by_suffix`: only formats with the suffix of the file are asked.
+        Parameters
+        ----------
+        faults : filled with errors of plug-ins; then only formats with the suffix of the file are asked
 
         Raises
         ------
         PluginError
-            No format recognises the file, and one of a plug-in cannot be asked.
+            Without `faults`: no format recognises the file, and one of a plug-in cannot be asked.
         """
-        faults: list[PluginError] = []
-        for name, format in self._usable(faults):
+        errors: list[KinefitError] = []
+        for name in self.names():
             try:
-                if (path.suffix.lower() in format.suffixes or not by_suffix) and format.recognises(path):
+                format = self.get(name)
+                found = path.suffix.lower() in format.suffixes
+                if format.recognise is not None and (found or faults is None):
+                    found = format.call("recognise", path, valid=lambda one: type(one) is bool, what="a bool")
+                if found:
                     return name
             except PluginError as error:
-                faults.append(error)
-        if faults:
-            raise faults[0]
+                errors.append(error)
+        for name, plugins in installed(GROUP).items():
+            if not name.startswith(_KINDS):
+                remedy = f"Its author writes {', '.join(f'{kind}{name}' for kind in _KINDS)}."
+                errors.append(plugins[0].error("has a name that states no kind of file", remedy))
+        if faults is not None:
+            faults += errors
+        elif errors:
+            raise errors[0]
         return None
-
-    def recognised(self, path: Path) -> FileFormat | None:
-        """The format that recognises a file, as `name_of`."""
-        name = self.name_of(path)
-        return None if name is None else self.get(name)
 
 
 KEYPOINTS = FileFormats(GROUP, FileFormat, "keypoint format", {

@@ -13,16 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit._files import npy_header, read_bytes, read_npy, read_table
+from kinefit._files import read_bytes, read_npy, read_table
 from kinefit._mapped import kept
-from kinefit.errors import FileError, ObservationError, choices, located, names_file
+from kinefit.errors import FileError, ObservationError, choices, names_file
 from kinefit.observations import Keypoints
 from kinefit.observations.arrays import sealed
 from kinefit.readers import keypoint_sets
 from kinefit.readers.formats import KEYPOINTS, FileFormat
 from kinefit.readers.keypoint_sets import (
     FACE_POINTS,
-    FACE_SET,
     HAND_POINTS,
     KEYPOINT_SETS,
     MEDIAPIPE_SETS,
@@ -145,12 +144,13 @@ def read_mediapipe(
     """
     path = Path(path)
     data = read_npy(path, remedy="Write it by numpy.save.")
-    keypoint_set = mediapipe_set((data.shape, data.dtype))
-    if keypoint_set is None:
+    sets = {(len(KEYPOINT_SETS[name]), 3): name for name in MEDIAPIPE_SETS}
+    sets |= dict.fromkeys(((n, 3) for n in FACE_POINTS), "MEDIAPIPE_478")
+    if data.dtype.kind not in "fiu" or data.shape[1:] not in sets:
         remedy = "Give x, y [px], visibility: (frames, 33, 3), with hands (frames, 75, 3), of a face (frames, 478, 3)."
         raise ObservationError(f"landmarks have shape {data.shape}", remedy=remedy)
     data, start = cut_frames(data, frames, path)
-    data = np.array(data, dtype=float)
+    data, keypoint_set = np.array(data, dtype=float), sets[data.shape[1:]]
     names = KEYPOINT_SETS[keypoint_set]
     pose = len(KEYPOINT_SETS["MEDIAPIPE_33"])
     for part in np.split(data, range(pose, len(names), HAND_POINTS) if len(names) < min(FACE_POINTS) else (), axis=1):
@@ -169,15 +169,7 @@ def read_mediapipe(
     return keypoint_record(data[:, None], camera, keypoint_set, rate, time_offset, start, path, image_frame)
 
 
-def mediapipe_set(header: tuple[tuple[int, ...], np.dtype] | None) -> str | None:
-    """Keypoint set of an array with this shape and type; None of another array, or of none."""
-    sets: dict[tuple[int, ...], str] = {(len(KEYPOINT_SETS[name]), 3): name for name in MEDIAPIPE_SETS}
-    sets |= dict.fromkeys(((n, 3) for n in FACE_POINTS), FACE_SET)
-    return sets.get(header[0][1:]) if header is not None and header[1].kind in "fiu" else None
-
-
 _CALISCOPE_HANDS = (100, 200)  # first indices of the right and of the left hand
-_MAX_HEADER_BYTES = 4096  # of a table of caliscope
 _GAPS, _PORTS = 20, 100  # indices for each that is there, and cameras, beyond which a table is damaged
 
 
@@ -240,6 +232,7 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
 
 
 @checked
+@names_file
 def read_keypoints(
     path: str | PathLike[str], *, format: str | None = None, camera: str, rate: float | None = None,
     time_offset: float = 0.0, image_frame: ImageFrame | None = None, **options: Any,
@@ -270,19 +263,16 @@ def read_keypoints(
     reader = KEYPOINTS.get(format)
     if reader.plugin is None and path.is_file():
         keypoint_sets.refuse_other_keypoints(path)
-    stated = f"Keypoints of the camera '{camera}'" + ("" if rate is None else f" at {rate:g} Hz")
-
-    def valid(one: Any) -> bool:
-        return isinstance(one, Keypoints) and one.camera == camera and rate in (None, one.rate)
-
-    with located(path):
-        record = reader.call("read", path, camera=camera, rate=rate, **options, valid=valid, what=stated)
+    record: Keypoints = reader.call(
+        "read", path, camera=camera, rate=rate, **options, what=f"Keypoints of the camera '{camera}' at {rate} Hz",
+        valid=lambda one: isinstance(one, Keypoints) and one.camera == camera and rate in (None, one.rate),
+    )  # fmt: skip
     points = record.points if image_frame is None else sealed(kept(image_frame.to_calibration(record.points)))
     return replace(record, points=points, time_offset=record.time_offset + time_offset)
 
 
 def _is_caliscope(path: Path) -> bool:
-    return path.suffix.lower() == ".csv" and b"sync_index" in read_bytes(path, _MAX_HEADER_BYTES)
+    return path.suffix.lower() == ".csv" and b"sync_index" in read_bytes(path, 4096)
 
 
 @names_file
@@ -360,15 +350,8 @@ def _numbers(people: list[OpenPosePerson], path: Path, keypoint_set: str) -> NDA
     return data
 
 
-OPENPOSE = FileFormat(
-    summary="OpenPose (Cao et al. 2021, IEEE TPAMI 43:172)", suffixes=(".json",), read=read_openpose,
-    recognise=Path.is_dir,
-)
-MEDIAPIPE = FileFormat(
-    summary="MediaPipe Pose (Bazarevsky et al. 2020, BlazePose)", suffixes=(".npy",), read=read_mediapipe,
-    recognise=lambda path: mediapipe_set(npy_header(path)) is not None,
-)
+OPENPOSE = FileFormat("OpenPose (Cao et al. 2021, IEEE TPAMI 43:172)", (), read_openpose, Path.is_dir)
+MEDIAPIPE = FileFormat("MediaPipe Pose (Bazarevsky et al. 2020, BlazePose)", (".npy",), read_mediapipe)
 CALISCOPE = FileFormat(
-    summary="the landmarks that Caliscope recorded", suffixes=(".csv",), read=_caliscope_camera,
-    recognise=_is_caliscope, has_all_cameras=True,
+    "the landmarks that Caliscope recorded", (".csv",), _caliscope_camera, _is_caliscope, has_all_cameras=True
 )

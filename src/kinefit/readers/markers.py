@@ -58,12 +58,12 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
     PluginError
         A plug-in fails.
     """
-    format = MARKERS.recognised(path := Path(path))
-    if format is None:
+    name = MARKERS.name_of(path := Path(path))
+    if name is None:
         remedy = f"Markers are read from .c3d and .trc files. {install('marker format')}"
         raise FileError("neither C3D nor TRC", remedy=remedy)
-    markers: Markers = format.call("read", path, unit=unit, valid=lambda m: isinstance(m, Markers), what="Markers")
-    return _of_one_unit(markers)
+    read = MARKERS.get(name).call("read", path, unit=unit, valid=lambda m: isinstance(m, Markers), what="Markers")
+    return _of_one_unit(read)
 
 
 def _is_c3d(path: Path) -> bool:
@@ -304,5 +304,5 @@ def _trc_rows(lines: list[str], ended: bool, count: int) -> tuple[NDArray, NDArr
     return table[:, 0], table[:, 1], table[:, 2:].reshape(len(rows), count, 3)
 
 
-C3D = FileFormat(summary="C3D", suffixes=(".c3d",), read=_read_c3d, recognise=_is_c3d)
-TRC = FileFormat(summary="TRC of OpenSim", suffixes=(".trc",), read=_read_trc, recognise=_is_trc)
+C3D = FileFormat("C3D", (".c3d",), _read_c3d, _is_c3d)
+TRC = FileFormat("TRC of OpenSim", (".trc",), _read_trc, _is_trc)

@@ -12,13 +12,14 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from kinefit.errors import KinefitError, PluginError, check_choice
+from kinefit._arguments import checked
+from kinefit.errors import KinefitError, ObservationError, PluginError, check_choice
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -96,7 +97,7 @@ class Plugin:
             raise self.error(f"cannot be imported: it {raised}", remedy) from error
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Extension:
     """Base of the records that plug-ins can add.
 
@@ -107,7 +108,7 @@ class Extension:
     """
 
     summary: str
-    plugin: Plugin | None = None
+    plugin: Plugin | None = field(default=None, kw_only=True)
 
     @property
     def comment(self) -> str:
@@ -237,4 +238,7 @@ def _record(of: Extensions[Any], name: str) -> Any:
     fault = record.fault(name) if isinstance(record, of.record) else f"is no {of.record.__name__}"
     if fault:
         raise plugin.error(fault)
-    return replace(record, plugin=plugin)
+    try:
+        return checked(type(record))(**vars(record) | {"plugin": plugin})
+    except ObservationError as error:
+        raise plugin.error(f"has a wrong record, {error.problem}", error.remedy) from error

@@ -201,7 +201,7 @@ def check_labels(markers: Markers, marker_set: str | None) -> list[Finding]:
     return found
 
 
-MARKER_FORMATS = ("motion", "mot", "osim", "trc", "bvh", "glb", "markers")
+WRITTEN = ("motion", "mot", "osim", "trc", "bvh", "glb", "markers")
 """Formats that are written where none are named."""
 
 _MARKERS = "markers.trc"  # what was measured, in OpenSim's world: with body.osim and its marker set, IK runs there too
@@ -237,7 +237,7 @@ class MarkerFitOptions:
 
 def fit_file(
     path: Path, out: Path | None = None, options: MarkerFitOptions | None = None, *, unit: str | None = None,
-    formats: Iterable[str] = MARKER_FORMATS, step: Step | None = None, notes: list[Finding] | None = None,
+    formats: Iterable[str] = WRITTEN, step: Step | None = None, notes: list[Finding] | None = None,
 ) -> dict[str, tuple[Motion, dict[str, Path]]]:  # fmt: skip
     """Fit a file of labelled markers and write what was found.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from kinefit._arguments import checked
 from kinefit._files import metres_of, parse_toml, read_bytes, read_text, write_text
-from kinefit.errors import CalibrationError, FileError, KinefitError, located
+from kinefit.errors import CalibrationError, FileError, KinefitError, located, names_file
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
 from kinefit.readers.calibration.colmap import colmap_cameras
@@ -57,6 +57,7 @@ _MAX_ORIGIN_DISTANCE = 200.0  # [m] a camera farther from the world's origin is 
 
 
 @checked
+@names_file
 def read_calibration(
     path: str | PathLike[str],
     *,
@@ -105,18 +106,11 @@ def read_calibration(
     try:
         return _read(path, unit, image_size, exteriors)
     except KinefitError:
-        with located(path):
-            format = CALIBRATIONS.recognised(path)
-        if format is None:
+        if (name := CALIBRATIONS.name_of(path)) is None:
             raise
-    with located(path):
-        size = image_size if callable(image_size) else lambda name: image_size
-        rig: Rig = format.call("read", path, unit=unit, image_size=size, valid=_is_rig, what="a Rig of cameras")
-        return rig
-
-
-def _is_rig(rig: object) -> bool:
-    return isinstance(rig, Rig) and len(rig) > 0
+    options = {"unit": unit, "image_size": image_size if callable(image_size) else lambda camera: image_size}
+    valid = lambda rig: isinstance(rig, Rig) and len(rig) > 0
+    return CALIBRATIONS.get(name).call("read", path, **options, valid=valid, what="a Rig")  # type: ignore[no-any-return]
 
 
 def _read(path: Path, unit: str | float, image_size: Sizes | None, exteriors: bool) -> Rig:

@@ -20,7 +20,7 @@ from kinefit._pictures import read_picture
 from kinefit.errors import CalibrationError, FileError, KinefitError, PluginError
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, SUFFIXES, read_calibration
-from kinefit.readers.formats import CALIBRATIONS, KEYPOINTS, MARKERS, FileFormats
+from kinefit.readers.formats import CALIBRATIONS, KEYPOINTS, MARKERS
 from kinefit.readers.guess.names import camera_of, natural
 from kinefit.readers.keypoint_sets import SPLIT, other_keypoints
 from kinefit.readers.keypoints import decode_openpose, read_keypoints
@@ -116,18 +116,17 @@ def find_recordings(files: list[Path]) -> list[Path]:
 
 
 def find_calibrations(
-    files: list[Path], videos: Sequence[Path] = (), folder: Path | None = None, *, remarks: list[str],
+    files: list[Path], videos: Sequence[Path] = (), folder: Path | None = None
 ) -> tuple[list[CalibrationFile], list[Path], list[KinefitError]]:
     """All calibrations of two or more cameras among files, by trying to read them.
 
     Parameters
     ----------
     videos : that give the image size of cameras without one, matched by their names below `folder`.
-    remarks : filled with what is wrong with plug-ins.
 
     Returns
     -------
-    calibrations; files of a single camera; errors of files that are calibrations but cannot be used.
+    calibrations; files of a single camera; errors of files that are calibrations but cannot be used, and of plug-ins.
     """
     found: list[CalibrationFile] = []
     singles: list[Path] = []
@@ -135,18 +134,18 @@ def find_calibrations(
     sizes = partial(_video_size, sorted(videos, key=lambda path: bool(OF_CALIBRATION.search(path.name))), folder)
     detectors = {folder for folder, group in _by_folder(files) if sum(map(_numbered, group)) > _MIN_SEQUENCE}
     for path in files:
-        known = path.name.lower().endswith(SUFFIXES) or _is_xml_text(path) or _format_of(CALIBRATIONS, path, remarks)
+        known = path.name.lower().endswith(SUFFIXES) or _is_xml_text(path) or CALIBRATIONS.name_of(path, faults)
         if not known or (path.parent in detectors and _numbered(path)):
             continue
         if path.stat().st_size > MAX_CALIBRATION_BYTES:
             continue
-        read = _try(path, faults, remarks, sizes)
+        read = _try(path, faults, sizes)
         if read and len(read.rig) > 1:
             found.append(read)
         elif read:
             singles.append(path)
     for place in _folders(files, singles):
-        read = _try(place, faults, remarks, sizes)
+        read = _try(place, faults, sizes)
         if read and len(read.rig) > 1:
             found.append(read)
             faults = [fault for fault in faults if Path(str(fault.file)).parent != place]
@@ -198,7 +197,7 @@ def _video_size(videos: Sequence[Path], folder: Path | None, camera: str) -> tup
 
 
 def _try(
-    path: Path, faults: list[KinefitError], remarks: list[str], video_size: Callable[[str], tuple[int, int] | None]
+    path: Path, faults: list[KinefitError], video_size: Callable[[str], tuple[int, int] | None]
 ) -> CalibrationFile | None:
     """Read a calibration; if it cannot be metres, in the unit with the most plausible camera distances."""
     sized: dict[str, tuple[int, int] | None] = {}
@@ -214,7 +213,7 @@ def _try(
                 faults.append(error)
             return None
     except PluginError as error:
-        _remark(error, remarks)
+        faults.append(error)
         return None
     except (KinefitError, RecursionError):
         return None
@@ -270,28 +269,16 @@ def _is_photograph(grey: NDArray) -> bool:
     return float(np.mean((grey > _MASK_TOLERANCE) & (grey < 255 - _MASK_TOLERANCE))) > _MIN_GREY_SHARE
 
 
-def _format_of(formats: FileFormats, path: Path, remarks: list[str]) -> str | None:
-    """Name of a file's format, by its suffix and content; an error of a plug-in is added to the remarks."""
-    try:
-        return formats.name_of(path, by_suffix=True)
-    except PluginError as error:
-        _remark(error, remarks)
-        return None
+def find_markers(files: list[Path], faults: list[KinefitError]) -> list[Path]:
+    """Files of markers; errors of plug-ins are added to `faults`."""
+    return [path for path in files if MARKERS.name_of(path, faults)]
 
 
-def _remark(error: KinefitError, remarks: list[str]) -> None:
-    """Add what is wrong to the remarks, once."""
-    remark = f"{error.problem}. {error.remedy or ''}".strip()
-    remarks += [] if remark in remarks else [remark]
+def find_keypoints(files: list[Path], faults: list[KinefitError]) -> tuple[list[KeypointFile], list[str]]:
+    """Keypoints of all formats of a take file; remarks on similar files of unknown formats.
 
-
-def find_markers(files: list[Path], remarks: list[str]) -> list[Path]:
-    """Files of markers; remarks on plug-ins are added to `remarks`."""
-    return [path for path in files if _format_of(MARKERS, path, remarks)]
-
-
-def find_keypoints(files: list[Path]) -> tuple[list[KeypointFile], list[str]]:
-    """Keypoints of all formats of a take file; and remarks on similar files of unknown formats."""
+    Errors of plug-ins are added to `faults`.
+    """
     found: list[KeypointFile] = []
     remarks: list[str] = []
     for folder, group in _by_folder(files):
@@ -306,27 +293,18 @@ def find_keypoints(files: list[Path]) -> tuple[list[KeypointFile], list[str]]:
             found.append(KeypointFile(path, "mediapipe", shape[0], shape[1]))
         elif suffix == ".csv" and (frames := _caliscope_frames(path)):
             found.append(KeypointFile(path, "caliscope", frames, 33))
-        elif (format := _format_of(KEYPOINTS, path, remarks)) and KEYPOINTS.get(format).plugin is not None:
-            found += _of_plugin(path, format, remarks)
+        elif (format := KEYPOINTS.name_of(path, faults)) and KEYPOINTS.plugins(format):
+            try:
+                record = read_keypoints(path, format=format, camera=path.stem, rate=1.0)
+                found.append(KeypointFile(path, format, len(record), len(record.names)))
+            except KinefitError as error:
+                faults.append(error)
         elif shape is not None and len(shape) >= 3 and shape[-1] in (2, 3):
             known = "landmarks are read as (frames, 33, 3), or (frames, 75, 3) with hands"
             remarks.append(f"{path.name}: an array of shape {shape}; {known}")
         elif suffix in _MAYBE_KEYPOINTS and (other := other_keypoints(path)):
             remarks.append(f"{path.name}: {other}; not used. {SPLIT}")
     return found, remarks
-
-
-def _of_plugin(path: Path, format: str, remarks: list[str]) -> list[KeypointFile]:
-    """A file of keypoints in a plug-in's format; none, and a remark, if it cannot be used."""
-    if KEYPOINTS.get(format).has_all_cameras:
-        remarks.append(f'{path.name}: several cameras; write a [[keypoints]] with format = "{format}" for each')
-        return []
-    try:
-        record = read_keypoints(path, format=format, camera=path.stem, rate=1.0)
-    except KinefitError as error:
-        _remark(error, remarks)
-        return []
-    return [KeypointFile(path, format, len(record), len(record.names))]
 
 
 def _openpose_points(numbered: list[Path]) -> int | None:

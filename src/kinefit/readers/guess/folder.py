@@ -66,13 +66,14 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
         raise TakeError("no such folder", file=folder, remedy="Name the folder with videos, keypoints and calibration.")
     draft = Draft(folder, Path(beside).absolute() if beside else folder)
     files = guess_files.list_files(folder)
-    faults: list[str] = []
+    faults: list[KinefitError] = []
     videos, markers = guess_files.find_videos(files, folder), guess_files.find_markers(files, faults)
-    keypoints, remarks = guess_files.find_keypoints(files)
+    keypoints, remarks = guess_files.find_keypoints(files, faults)
     recordings = guess_files.find_recordings(files)
-    for about, texts in (("markers", faults), ("keypoints", remarks)):
-        for text in texts:
-            draft.note(about, "open", text)
+    for remark in remarks:
+        draft.note("keypoints", "open", remark)
+    for fault in faults:
+        draft.note_error("files", fault)
     _describe_kinds(draft, files)
     if not (videos or keypoints or markers or recordings or any(draft.tables.values())):
         raise TakeError(
@@ -99,7 +100,7 @@ def _describe_kinds(draft: Draft, files: Sequence[Path]) -> None:
             kind, valid = KINDS.get(table), lambda found: all(isinstance(one, Proposal) and one.entry for one in found)
             found = kind.call("propose", files, valid=valid, what="proposals with an entry") if kind.propose else []
         except PluginError as error:
-            draft.note(table, "open", f"{error.problem}. {error.remedy or ''}".strip())
+            draft.note_error(table, error)
             continue
         for one in found:
             (key, first), *more = one.entry.items()
@@ -114,12 +115,12 @@ def _choose_calibration(
 ) -> CalibrationFile | None:
     """The calibration that most files fit; from the parent folder if there is none here; None without one."""
     videos = guess_files.find_videos(files, draft.folder)
-    remarks: list[str] = []
-    found, singles, faults = guess_files.find_calibrations(files, videos, draft.folder, remarks=remarks)
+    found, singles, faults = guess_files.find_calibrations(files, videos, draft.folder)
+    for fault in [fault for fault in faults if isinstance(fault, PluginError)]:
+        draft.note_error("calibration", fault)
+        faults.remove(fault)
     if not found:
-        found = guess_files.find_calibrations(_above(draft.folder), videos, draft.folder, remarks=remarks)[0]
-    for remark in remarks:
-        draft.note("calibration", "open", remark)
+        found = guess_files.find_calibrations(_above(draft.folder), videos, draft.folder)[0]
     if not found and markers:
         draft.note("calibration", "open", f"none, so videos and keypoints are not used. {_CALIBRATE}")
         return None
@@ -253,7 +254,7 @@ def _calibration(draft: Draft, path: Path) -> Rig | None:
     try:
         rig = mcap_rig(path)
     except CalibrationError as error:
-        draft.note("calibration", "open", f"{error.problem}. {error.remedy or ''}".strip())
+        draft.note_error("calibration", error)
         return None
     why = f"{len(rig)} cameras: {', '.join(rig.names)}"
     draft.calibration = CalibrationFile(path, rig), {"file": Value(path, "sure", why)}

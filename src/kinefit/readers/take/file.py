@@ -41,11 +41,7 @@ from kinefit.readers.take.entries import (
     entry_class,
     keys_of,
 )
-from kinefit.readers.take.kinds import (
-    BUILT_IN,
-    KINDS,
-    WrongEntryError,
-)
+from kinefit.readers.take.kinds import BUILT_IN, KINDS, WrongEntryError
 
 __all__ = ["Take", "read_take"]
 

@@ -139,21 +139,19 @@ def naming_plugins(sensors: Iterable[tuple[str, SensorKind]], file: Path) -> Ite
     PluginError
         Code of a plug-in raised an error, or a sensor of one broke the rules of sensors.
     """
-    of_plugins = [(name, kind.table, kind.plugin) for name, kind in sensors if kind.plugin is not None]
     try:
         yield
     except PluginError:
         raise
-    except KinefitError as error:
-        for name, table, plugin in of_plugins:
-            if f"sensor '{name}'" in error.problem:
-                more: dict[str, Any] = {"file": file, "place": f"[[{table}]]"}
-                raise plugin.error(f"failed: {error.problem}", error.remedy, **more) from error
-        raise
     except Exception as error:
-        for _, table, plugin in of_plugins:
-            if raised := plugin.raised(error):
-                raise plugin.error(raised, file=file, place=f"[[{table}]]") from error
+        for name, kind in sensors:
+            more: dict[str, Any] = {"file": file, "place": f"[[{kind.table}]]"}
+            if kind.plugin is None:
+                continue
+            if isinstance(error, KinefitError) and f"sensor '{name}'" in error.problem:
+                raise kind.plugin.error(f"failed: {error.problem}", error.remedy, **more) from error
+            if not isinstance(error, KinefitError) and (raised := kind.plugin.raised(error)):
+                raise kind.plugin.error(raised, **more) from error
         raise
 
 
@@ -164,9 +162,9 @@ def kinds_of(take: Any) -> list[SensorKind]:
 
 def plugins_of(take: Any) -> list[Plugin]:
     """Plug-ins of the kinds of a take, and those that know its files."""
-    records: list[Extension | None] = [*kinds_of(take)]
-    records += [KEYPOINTS.get(entry.format) for entry in take.keypoints if entry.format in KEYPOINTS.names()]
-    records += [MARKERS.recognised(entry.file) for entry in take.markers]
+    found = [KINDS.plugins(table) for table in take.sensors]
+    found += [KEYPOINTS.plugins(entry.format) for entry in take.keypoints]
+    found += [MARKERS.plugins(MARKERS.name_of(entry.file) or "") for entry in take.markers]
     with suppress(PluginError):  # which reading the calibration raises, if kinefit itself cannot
-        records += [] if take.calibration is None else [CALIBRATIONS.recognised(take.calibration.file)]
-    return list(dict.fromkeys(record.plugin for record in records if record is not None and record.plugin is not None))
+        found += [CALIBRATIONS.plugins((take.calibration and CALIBRATIONS.name_of(take.calibration.file)) or "")]
+    return list(dict.fromkeys(plugin for plugins in found for plugin in plugins))
