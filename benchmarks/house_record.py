@@ -60,7 +60,7 @@ def _take_keys() -> Iterator[str]:
 
 
 def _formats() -> Iterator[str]:
-    from kinefit.batch.formats import FORMATS
+    from kinefit.batch.results import FORMATS
     from kinefit.readers.calibration.read import FORMATS as CALIBRATIONS
     from kinefit.readers.depth.recordings import FORMATS as DEPTHS
 

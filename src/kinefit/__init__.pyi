@@ -23,8 +23,8 @@ from kinefit.readers.take.kinds import Proposal as Proposal, SensorKind as Senso
 from kinefit.sensors.scene import Scene as Scene
 
 # Formats of one's own
-from kinefit.batch.formats import MotionFormat as MotionFormat
-from kinefit.readers.formats import FileFormat as FileFormat
+from kinefit.batch.results import MotionFormat as MotionFormat
+from kinefit.readers.plugins import FileFormat as FileFormat
 
 # From a recording to a motion
 from kinefit.batch.many import track_takes as track_takes

@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from kinefit.batch.formats import FORMATS
+from kinefit.batch.results import FORMATS
 from kinefit.bodies import catalogue, load_body
 from kinefit.bodies.toml import records
 from kinefit.bodies.toml.bodies import JOINT_TYPES

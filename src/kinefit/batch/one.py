@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from kinefit._files import regular
-from kinefit.batch.formats import DEFAULT_FORMATS, FORMATS, check_formats
 from kinefit.batch.processes import progress
-from kinefit.batch.results import Step, write_overlays, write_results
+from kinefit.batch.results import DEFAULT_FORMATS, FORMATS, Step, check_formats, write_overlays, write_results
 from kinefit.batch.summary import DONE, RECORD, Range, Row, failed, write_people_report
 from kinefit.errors import KinefitError, TakeError, printable
 from kinefit.findings import of_provenance

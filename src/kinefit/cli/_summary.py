@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kinefit.batch.formats import description
+from kinefit.batch.results import description
 from kinefit.cli._screen import print_table, say
 from kinefit.findings import frame_ranges
 

@@ -19,7 +19,6 @@ from kinefit.errors import FileError, ObservationError, choices, names_file
 from kinefit.observations import Keypoints
 from kinefit.observations.arrays import sealed
 from kinefit.readers import keypoint_sets
-from kinefit.readers.formats import KEYPOINTS, FileFormat
 from kinefit.readers.keypoint_sets import (
     FACE_POINTS,
     HAND_POINTS,
@@ -32,6 +31,7 @@ from kinefit.readers.keypoint_sets import (
     keypoint_names,
     keypoint_record,
 )
+from kinefit.readers.plugins import KEYPOINTS, FileFormat
 
 if TYPE_CHECKING:
     from kinefit.geometry.camera import ImageFrame
@@ -259,8 +259,7 @@ def read_keypoints(
     """
     path = Path(path)
     format = format or KEYPOINTS.name_of(path) or "mediapipe"
-    KEYPOINTS.check(format, ObservationError, file=path)
-    reader = KEYPOINTS.get(format)
+    reader = KEYPOINTS.get(format, ObservationError)
     if reader.plugin is None and path.is_file():
         keypoint_sets.refuse_other_keypoints(path)
     record: Keypoints = reader.call(

@@ -15,8 +15,7 @@ from kinefit._files import metres_of, read_bytes
 from kinefit.errors import FileError, ObservationError, names_file, shortened
 from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
-from kinefit.readers.formats import MARKERS, FileFormat
-from kinefit.readers.plugins import install
+from kinefit.readers.plugins import MARKERS, FileFormat
 
 _MAX_NEAR_ORIGIN = 0.01  # [m] from the origin, of a person in metres that are read as millimetres
 _COMPUTED_POINTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # of a C3D: no positions
@@ -60,8 +59,7 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
     """
     name = MARKERS.name_of(path := Path(path))
     if name is None:
-        remedy = f"Markers are read from .c3d and .trc files. {install('marker format')}"
-        raise FileError("neither C3D nor TRC", remedy=remedy)
+        raise FileError("neither C3D nor TRC", remedy="Markers are read from .c3d and .trc files, or by a plug-in.")
     read = MARKERS.get(name).call("read", path, unit=unit, valid=lambda m: isinstance(m, Markers), what="Markers")
     return _of_one_unit(read)
 

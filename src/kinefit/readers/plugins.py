@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -24,7 +25,6 @@ from kinefit.errors import KinefitError, ObservationError, PluginError, check_ch
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 PLUGIN_COMMENT = "of the plug-in "
 """Begin of the comment that `kinefit init` writes beside the name of a plug-in; its distribution follows."""
 
@@ -135,7 +135,7 @@ class Extension:
         except KinefitError:
             raise
         except Exception as error:
-            if self.plugin is None or getattr(error, "errno", None) in _DISK_FULL:
+            if self.plugin is None or getattr(error, "errno", None) == errno.ENOSPC:
                 raise
             raised = self.plugin.raised(error) or f"raised {type(error).__name__}: {error}"
             raise self.plugin.error(raised, place=f"`{part}`") from error
@@ -191,25 +191,31 @@ class Extensions(Generic[_Record]):
             remedy = f"Remove one: pip uninstall {found[1].distribution}."
             raise found[0].error(f"has the same name as {found[1].version}", remedy)
 
-    def check(self, name: str, error: type[KinefitError], *, valid: Iterable[str] = (), **more: Any) -> None:
-        """Raise an error for a name that neither kinefit nor a plug-in has, nor is one of `valid`."""
-        check_choice(self.what, name, (*self.names(), *valid), error, **{"remedy": install(self.what)} | more)
-
-    def get(self, name: str) -> _Record:
-        """The record of a name that exists, imported now.
+    def get(self, name: str, error: type[KinefitError] = PluginError, **more: Any) -> _Record:
+        """The record of a name, imported now.
 
         Raises
         ------
+        `error`, with `more`
+            A name that neither kinefit nor a plug-in has: what there is, and what to install.
         PluginError
             As `refuse_shadows`; a plug-in that cannot be imported, or whose record is wrong.
         """
+        check_choice(self.what, name, self.names(), error, **{"remedy": install(self.what)} | more)
         record: _Record = _record(self, name)
         return record
 
 
-def install(what: str, distribution: str = "its package") -> str:
-    """Remedy for the name of something that is not known."""
-    pip = f"{sys.executable} -m pip install {distribution}"
+def install(what: str, name: str = "", text: str = "") -> str:
+    """Remedy for the name of something that is not known.
+
+    Parameters
+    ----------
+    what : that it is the name of
+    name, text : pattern of the name in a take file, and its text, in which `kinefit init` wrote the distribution
+    """
+    noted = re.search(rf"^{name}\s*#.*{PLUGIN_COMMENT}(\S+)", text, re.MULTILINE)
+    pip = f"{sys.executable} -m pip install {noted[1] if noted else 'its package'}"
     return f"Correct the name, or install the plug-in that adds this {what}: {pip}."
 
 
@@ -235,10 +241,81 @@ def _record(of: Extensions[Any], name: str) -> Any:
         return getattr(import_module(module), attribute)
     plugin = of.plugins(name)[0]
     record = plugin.load()
-    fault = record.fault(name) if isinstance(record, of.record) else f"is no {of.record.__name__}"
-    if fault:
-        raise plugin.error(fault)
+    if not isinstance(record, of.record):
+        raise plugin.error(f"is no {of.record.__name__}")
     try:
-        return checked(type(record))(**vars(record) | {"plugin": plugin})
+        record = checked(type(record))(**vars(record) | {"plugin": plugin})
     except ObservationError as error:
         raise plugin.error(f"has a wrong record, {error.problem}", error.remedy) from error
+    if fault := record.fault(name):
+        raise plugin.error(fault)
+    return record
+
+
+@dataclass(frozen=True)
+class FileFormat(Extension):
+    """A format of files that are read into keypoints, markers or a rig.
+
+    Parameters
+    ----------
+    suffixes : ends of the names of such files, in lower case, ".csv"
+    read : of keypoints (path, *, camera, rate) -> `Keypoints` of this camera and rate [Hz], in pixels of the file; of
+        markers (path, *, unit) -> `Markers` [m], with the unit that the user states, or None; of a calibration
+        (path, *, unit, image_size) -> `Rig` [m], with "auto" or the unit that the user states, and a function that
+        gives (width, height) [px] or None for the name of a camera
+    recognise : (path) -> whether a file is of this format; default: by the end of its name
+    has_all_cameras : whether a file of keypoints is of several cameras
+    """
+
+    suffixes: tuple[str, ...]
+    read: Callable[..., Any]
+    recognise: Callable[[Path], bool] | None = None
+    has_all_cameras: bool = False
+
+
+class FileFormats(Extensions[FileFormat]):
+    """The formats of one kind of file."""
+
+    def name_of(self, path: Path, faults: list[KinefitError] | None = None) -> str | None:
+        """Name of the format that recognises a file, kinefit's own asked first; None if none does.
+
+        Parameters
+        ----------
+        faults : filled with errors of plug-ins; then only formats with the suffix of the file are asked
+
+        Raises
+        ------
+        PluginError
+            Without `faults`: no format recognises the file, and one of a plug-in cannot be asked.
+        """
+        errors: list[KinefitError] = []
+        for name in self.names():
+            try:
+                format = self.get(name)
+                found = path.name.lower().endswith(format.suffixes)
+                if format.recognise is not None and (found or faults is None):
+                    found = format.call("recognise", path, valid=lambda one: type(one) is bool, what="a bool")
+                if found:
+                    return name
+            except PluginError as error:
+                errors.append(error)
+        if faults is not None:
+            faults += errors
+        elif errors:
+            raise errors[0]
+        return None
+
+
+KEYPOINTS = FileFormats("kinefit.readers", FileFormat, "keypoint format", {
+    "openpose": "kinefit.readers.keypoints:OPENPOSE", "mediapipe": "kinefit.readers.keypoints:MEDIAPIPE",
+    "caliscope": "kinefit.readers.keypoints:CALISCOPE",
+}, "keypoints.")  # fmt: skip
+"""Formats of keypoints, which take files name; the most informative confidence first."""
+
+MARKERS = FileFormats("kinefit.readers", FileFormat, "marker format", {
+    "c3d": "kinefit.readers.markers:C3D", "trc": "kinefit.readers.markers:TRC",
+}, "markers.")  # fmt: skip
+"""Formats of labelled or unlabelled markers."""
+
+CALIBRATIONS = FileFormats("kinefit.readers", FileFormat, "calibration format", {}, "calibration.")
+"""Formats of calibrations of plug-ins; those of kinefit are recognised together, by `read_calibration`."""

@@ -65,7 +65,7 @@ EXTRAS = {"nwb": "ndx_pose", "mcap": "mcap_ros2", "rrd": "rerun"}
 
 
 def test_every_choice_that_help_lists_is_one_of_the_exporter(file):
-    from kinefit.batch.formats import FORMATS, OPTIONS
+    from kinefit.batch.results import FORMATS, OPTIONS
 
     for format in FORMATS.built_in:
         for key in OPTIONS:

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from tests.cli.stopping import STOPPABLE
 
 import kinefit
-from kinefit.batch.formats import DEFAULT_FORMATS, FORMATS
+from kinefit.batch.results import DEFAULT_FORMATS, FORMATS
 from kinefit.cli import main
 from kinefit.cli._summary import bone_lengths
 from kinefit.errors import ObservationError

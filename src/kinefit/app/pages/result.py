@@ -27,7 +27,7 @@ from kinefit.app.pages.shell import (
 from kinefit.app.review import Review
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
-from kinefit.batch.formats import FORMATS, description, write_format
+from kinefit.batch.results import FORMATS, description, write_format
 from kinefit.batch.viewed import is_outdated
 from kinefit.errors import KinefitError
 from kinefit.exporters.report.moments import Moment, doubtful_moments

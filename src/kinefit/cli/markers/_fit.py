@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kinefit.batch.formats import FORMATS, check_formats
-from kinefit.batch.results import write_results
+from kinefit.batch.results import FORMATS, check_formats, write_results
 from kinefit.bodies import Body, PointSet, load_body
 from kinefit.bodies.marker_sets import bare, find_marker_set, load_marker_set, matched, read_sides
 from kinefit.cli import _screen
 from kinefit.cli._screen import Step, check_file, note
-from kinefit.errors import ExportError, KinefitError, ObservationError, located
+from kinefit.errors import KinefitError, ObservationError, located
 from kinefit.exporters.skeletons.common import plain_names
 from kinefit.findings import FINDINGS, Finding, as_records, faults_of
 from kinefit.identification.model.from_frame import model_from_frame
@@ -268,9 +267,6 @@ def fit_file(
 
     step, formats, options = step or (lambda what, done, total: None), tuple(formats), options or MarkerFitOptions()
     folder = out if out is not None else path.with_name(f"{path.stem}-kinefit")
-    unknown = [name for name in formats if name not in (*FORMATS.names(), "markers")]
-    if unknown:
-        raise ExportError(_screen.no_format(unknown[0], (*FORMATS.names(), "markers")), remedy="Correct --formats.")
     check_formats(name for name in formats if name != "markers")
     _screen.check_folder(folder)
     generic = load_body(options.body)

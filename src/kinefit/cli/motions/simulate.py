@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kinefit.batch.formats import FORMATS, OPTIONS, description, write_format
+from kinefit.batch.results import FORMATS, OPTIONS, description, write_format
 from kinefit.cli import _screen
 from kinefit.errors import spelled
 
@@ -23,8 +23,8 @@ NAMES = tuple(name for name in FORMATS.names() if name != "motion")
 
 def _choices(format: str) -> str:
     """The values of a format's options, or the plug-in that has them."""
-    if plugins := FORMATS.plugins(format):
-        return f"of the plug-in {plugins[0].version}"
+    if FORMATS.plugins(format):
+        return description(format)
     stated = {key: getattr(FORMATS.get(format), key) for key in OPTIONS}
     return "; ".join(f"--{key} {' '.join(values)}" for key, values in stated.items() if values) or "none"
 

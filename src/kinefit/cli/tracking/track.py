@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kinefit.batch.formats import DEFAULT_FORMATS, FORMATS
+from kinefit.batch.results import DEFAULT_FORMATS, FORMATS
 from kinefit.cli import _screen
 
 if TYPE_CHECKING:

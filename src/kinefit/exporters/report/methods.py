@@ -15,7 +15,7 @@ from kinefit.exporters.report.fit import overall_median, sensor_fits
 from kinefit.exporters.tables import split_side
 from kinefit.findings import listed
 from kinefit.motion import SHOWN_UNITS, Motion
-from kinefit.readers.formats import KEYPOINTS
+from kinefit.readers.plugins import KEYPOINTS
 
 _BUILT_IN_DETECTOR = "MediaPipe's pose networks as kinefit runs them (Bazarevsky et al. 2020, BlazePose)"
 

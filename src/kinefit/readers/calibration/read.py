@@ -25,7 +25,7 @@ from kinefit.readers.calibration.matlab import matlab_tree, read_mat
 from kinefit.readers.calibration.mocap import qualisys_cameras, vicon_cameras
 from kinefit.readers.calibration.tables import Sizes, camera_from_table, read_table
 from kinefit.readers.calibration.trees import stereo_tables, tables_of
-from kinefit.readers.formats import CALIBRATIONS
+from kinefit.readers.plugins import CALIBRATIONS
 from kinefit.readers.ros.images import mcap_rig
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.entries import CalibrationEntry

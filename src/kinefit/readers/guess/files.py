@@ -20,10 +20,10 @@ from kinefit._pictures import read_picture
 from kinefit.errors import CalibrationError, FileError, KinefitError, PluginError
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, SUFFIXES, read_calibration
-from kinefit.readers.formats import CALIBRATIONS, KEYPOINTS, MARKERS
 from kinefit.readers.guess.names import camera_of, natural
 from kinefit.readers.keypoint_sets import SPLIT, other_keypoints
 from kinefit.readers.keypoints import decode_openpose, read_keypoints
+from kinefit.readers.plugins import CALIBRATIONS, KEYPOINTS, MARKERS
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.video import ENDINGS, ImageFolder, Video
 
@@ -212,10 +212,8 @@ def _try(
             if "no camera in it" not in error.problem and (error.place or _CALIBRATION_NAME.search(path.name)):
                 faults.append(error)
             return None
-    except PluginError as error:
-        faults.append(error)
-        return None
-    except (KinefitError, RecursionError):
+    except (KinefitError, RecursionError) as error:
+        faults += [error] if isinstance(error, PluginError) else []
         return None
     rigs = {unit: read_calibration(path, unit=unit, image_size=size_of) for unit in _UNITS}
     unit = min(rigs, key=lambda u: abs(np.log(_spread(rigs[u]) / 3.0)))  # 3 m from the scene is typical

@@ -116,9 +116,9 @@ def _choose_calibration(
     """The calibration that most files fit; from the parent folder if there is none here; None without one."""
     videos = guess_files.find_videos(files, draft.folder)
     found, singles, faults = guess_files.find_calibrations(files, videos, draft.folder)
-    for fault in [fault for fault in faults if isinstance(fault, PluginError)]:
-        draft.note_error("calibration", fault)
-        faults.remove(fault)
+    for error in [fault for fault in faults if isinstance(fault, PluginError)]:
+        draft.note_error("calibration", error)
+        faults.remove(error)
     if not found:
         found = guess_files.find_calibrations(_above(draft.folder), videos, draft.folder)[0]
     if not found and markers:

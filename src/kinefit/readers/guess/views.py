@@ -14,12 +14,12 @@ from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.geometry.lines import triangulate_robust
 from kinefit.motion import UP_AXES
 from kinefit.observations import Keypoints
-from kinefit.readers.formats import KEYPOINTS
 from kinefit.readers.guess.draft import Draft, Value
 from kinefit.readers.guess.files import STATIC, KeypointFile
 from kinefit.readers.guess.names import Trial, camera_number, common_words, trials
 from kinefit.readers.keypoint_sets import HAND_POINTS, OPENPOSE_HANDS, SET_OF_COUNT, SETS_WITH_HANDS
 from kinefit.readers.keypoints import read_keypoints
+from kinefit.readers.plugins import KEYPOINTS
 from kinefit.readers.video import Video
 
 Size = tuple[int, int]
@@ -392,11 +392,8 @@ def keypoint_entries(
     if frame is not None:
         draft.note_value(f"keypoints, {format}", frame, "frame")
     for name, record in records.items():
-        reader = KEYPOINTS.get(format)
-        entry = {
-            "camera": Value(name), "file": Value(source[name].path),
-            "format": Value(format, why="" if reader.plugin is None else reader.comment),
-        }  # fmt: skip
+        why = KEYPOINTS.get(format).comment if KEYPOINTS.plugins(format) else ""
+        entry = {"camera": Value(name), "file": Value(source[name].path), "format": Value(format, why=why)}
         if format == "openpose":
             of_two = source[name].points in _AMBIGUOUS_COUNTS
             why = f"{source[name].points} points" + ", recognised by the lengths of the bones" * of_two

@@ -12,8 +12,8 @@ from kinefit.errors import FileError, ObservationError, TakeError, choices, comm
 from kinefit.motion import UP_AXES
 from kinefit.observations.recordings import PersonChoice
 from kinefit.readers.depth.images import listed
-from kinefit.readers.formats import KEYPOINTS
 from kinefit.readers.keypoint_sets import FACE_SET
+from kinefit.readers.plugins import KEYPOINTS
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.entries import NO_FILES, SINGLE_TABLES, Take, keys_of
 

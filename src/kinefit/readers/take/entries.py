@@ -22,9 +22,9 @@ from kinefit._files import LENGTHS, worth
 from kinefit.errors import choices, located
 from kinefit.geometry import se3
 from kinefit.observations import KEYPOINT_SIGMA
-from kinefit.readers.formats import KEYPOINTS
 from kinefit.readers.keypoint_sets import FACE_SET, KEYPOINT_SETS, MEDIAPIPE_SETS
-from kinefit.readers.take.kinds import KINDS, TakeEntry, WrongEntryError, refuse
+from kinefit.readers.plugins import KEYPOINTS
+from kinefit.readers.take.kinds import KINDS, TakeEntry, refuse
 
 _Read = TypeVar("_Read")
 Pixels = Annotated[float, Meta(gt=0, lt=1e4, description="Give a positive number of pixels.")]
@@ -149,7 +149,6 @@ class KeypointsEntry(TakeEntry, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         files, own = KEYPOINTS.names(), (*KEYPOINTS.built_in, *NO_FILES)
-        KEYPOINTS.check(self.format, WrongEntryError, valid=NO_FILES)
         self._uses(self.format, {
             "file": (*files, "detect"), "frame": files, "rate": files, "face": ("skin",), "stream": ("openpose",),
             "excluded": (*files, "detect"), "swapped": (*files, "detect"), "set": own,

@@ -26,9 +26,8 @@ from kinefit.errors import (
     printable,
     shortened,
 )
-from kinefit.readers.formats import KEYPOINTS, MARKERS
 from kinefit.readers.guess.files import VIDEOS
-from kinefit.readers.plugins import PLUGIN_COMMENT, install
+from kinefit.readers.plugins import KEYPOINTS, MARKERS, install
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
@@ -107,7 +106,7 @@ def _tidy(raw: dict[str, Any], path: Path, text: str) -> None:
     """Name an unknown table or key, and what exists; put new names of keys, metres and topics in place."""
     for table, content in raw.items():
         with located(path, f"[{table}]"):
-            remedy = _plugin_for("table", rf"\[\[{re.escape(table)}\]\]", text)
+            remedy = install("table", rf"\[\[{re.escape(table)}\]\]", text)
             check_choice("sensor or table", table, [*TABLES, *KINDS.names()], TakeError, remedy=remedy)
             KINDS.refuse_shadows(table, TABLES)
         many = table not in SINGLE_TABLES
@@ -123,17 +122,10 @@ def _tidy(raw: dict[str, Any], path: Path, text: str) -> None:
                     if (value := worth(row.get(key), units)) is not None:
                         row[key] = value
                 if table == "keypoints" and isinstance(format := row.get("format"), str) and format not in NO_FILES:
-                    remedy = _plugin_for(KEYPOINTS.what, rf'format *= *"{re.escape(format)}"', text)
-                    KEYPOINTS.check(format, TakeError, valid=NO_FILES, remedy=remedy)
-                    KEYPOINTS.get(format)
+                    remedy = install(KEYPOINTS.what, rf'format *= *"{re.escape(format)}"', text)
+                    KEYPOINTS.get(format, TakeError, remedy=remedy)
                 if isinstance(topic := row.get("topic"), str):
                     _name_topic(topic, row, "video" if table == "camera" else "file", path)
-
-
-def _plugin_for(what: str, name: str, text: str) -> str:
-    """What to install for a name (a pattern) of a plug-in: the distribution that `kinefit init` wrote beside it."""
-    noted = re.search(rf"^{name}\s*#.*{PLUGIN_COMMENT}(\S+)", text, re.MULTILINE)
-    return install(what, noted[1]) if noted else install(what)
 
 
 def _rename(table: str, row: dict[str, Any], path: Path, place: str) -> None:

@@ -19,8 +19,7 @@ from kinefit.bodies import Body
 from kinefit.errors import KinefitError, PluginError, TakeError
 from kinefit.findings import Finding
 from kinefit.observations.videos import SensorRecording
-from kinefit.readers.formats import CALIBRATIONS, KEYPOINTS, MARKERS
-from kinefit.readers.plugins import Extension, Extensions, Plugin
+from kinefit.readers.plugins import CALIBRATIONS, KEYPOINTS, MARKERS, Extension, Extensions, Plugin
 
 BUILT_IN = {
     "silhouette": "kinefit.sensors.kinds.silhouettes:SILHOUETTES",
