@@ -15,8 +15,8 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from kinefit._arguments import checked
@@ -235,10 +235,7 @@ def _record(of: Extensions[Any], name: str) -> Any:
     of.refuse_shadows(name)
     if name in of.built_in:
         own = of.built_in[name]
-        if not isinstance(own, str):
-            return own
-        module, _, attribute = own.partition(":")
-        return getattr(import_module(module), attribute)
+        return resolve_name(own) if isinstance(own, str) else own
     plugin = of.plugins(name)[0]
     record = plugin.load()
     if not isinstance(record, of.record):
@@ -288,7 +285,7 @@ class FileFormats(Extensions[FileFormat]):
         PluginError
             Without `faults`: no format recognises the file, and one of a plug-in cannot be asked.
         """
-        errors: list[KinefitError] = []
+        errors = [] if faults is None else faults
         for name in self.names():
             try:
                 format = self.get(name)
@@ -299,9 +296,7 @@ class FileFormats(Extensions[FileFormat]):
                     return name
             except PluginError as error:
                 errors.append(error)
-        if faults is not None:
-            faults += errors
-        elif errors:
+        if errors and faults is None:
             raise errors[0]
         return None
 
