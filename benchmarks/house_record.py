@@ -60,11 +60,11 @@ def _take_keys() -> Iterator[str]:
 
 
 def _formats() -> Iterator[str]:
-    from kinefit.batch.results import NAMES
+    from kinefit.batch.results import FORMATS
     from kinefit.readers.calibration.read import FORMATS as CALIBRATIONS
     from kinefit.readers.depth.recordings import FORMATS as DEPTHS
 
-    yield from (f"format track {name}" for name in NAMES)
+    yield from (f"format track {name}" for name in FORMATS.built_in)
     for kind, texts in (("calibration", CALIBRATIONS), ("depth", DEPTHS)):
         yield from (f"format {kind} {one.strip()}" for one in texts.split(","))
 

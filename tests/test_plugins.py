@@ -16,6 +16,7 @@ from tests.docs.blocks import blocks
 from kinefit.batch.many import track_takes
 from kinefit.batch.one import Choices
 from kinefit.errors import FileError, ObservationError, PluginError, TakeError
+from kinefit.readers import plugins
 from kinefit.readers.guess.folder import guess_take
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take import kinds
@@ -127,7 +128,7 @@ def here(plugin, monkeypatch):
     def forget():
         sys.modules.pop("kinefit_insole", None)
         importlib.invalidate_caches()
-        for found in (kinds.plugins, kinds.kind_of):
+        for found in (plugins.installed, plugins._record):
             found.cache_clear()
 
     forget()
@@ -343,7 +344,7 @@ def test_an_insole_alone_gives_no_first_pose(here, tmp_path, recording):
 
 def test_a_kind_that_is_not_installed(recording):
     text = recording.read_text()
-    words = r"there are: .*tracker.*install the plug-in that reads \[\[insole\]\]: .* -m pip install the package"
+    words = r"there are: .*tracker.*install the plug-in that adds this table: .* -m pip install its package"
     with pytest.raises(TakeError, match=f"no sensor or table 'insole'; {words}"):
         read_take(recording)
     recording.write_text(text.replace("[[insole]]", "[[insole]]    # of the plug-in kinefit-insole 0.1: pressure"))
@@ -419,7 +420,7 @@ def test_a_killed_run_goes_on_with_the_state_of_the_plugin(here, short, tmp_path
             raise Killed
 
     def followed(**more):
-        of_take = [kinds.kind_of(table) for table in take.sensors]
+        of_take = [kinds.KINDS.get(table) for table in take.sensors]
         with Checkpoint(tmp_path / "unfinished", key_of(take), kinds=of_take) as unfinished:
             return track_take(take, smooth=False, checkpoint=unfinished, **more)[0]
 
@@ -433,7 +434,7 @@ def test_a_killed_run_goes_on_with_the_state_of_the_plugin(here, short, tmp_path
     assert again.residuals["insole"].values.tobytes() == whole.residuals["insole"].values.tobytes()
     old = key_of(take)
     here(*PREPARED)
-    kinds.kind_of("insole")
+    kinds.KINDS.get("insole")
     assert key_of(take) != old
 
 
@@ -445,7 +446,7 @@ def test_a_state_that_cannot_be_stored_is_named(here, short, tmp_path):
         )
     )
     take = read_take(short)
-    of_take = [kinds.kind_of(table) for table in take.sensors]
+    of_take = [kinds.KINDS.get(table) for table in take.sensors]
     with Checkpoint(tmp_path / "unfinished", key_of(take), kinds=of_take) as unfinished:
         refused(
             lambda take: track_take(take, smooth=False, checkpoint=unfinished),
@@ -461,7 +462,8 @@ def test_a_state_that_cannot_be_stored_is_named(here, short, tmp_path):
 
 def test_many_takes_with_a_plugin(here, short, tmp_path, monkeypatch):
     monkeypatch.setenv(
-        "PYTHONPATH", os.pathsep.join([str(kinds.plugins()["insole"][0].point.dist.locate_file("")), str(ROOT / "src")])
+        "PYTHONPATH",
+        os.pathsep.join([str(kinds.KINDS.plugins("insole")[0].point.dist.locate_file("")), str(ROOT / "src")]),
     )
     choices = Choices(formats=("csv",), report=False, overlays=False, smooth=False)
     (row,) = track_takes(str(short), tmp_path / "out", choices=choices)
@@ -476,7 +478,7 @@ def test_the_page_explains_every_part_of_a_kind():
 
 @pytest.mark.parametrize("table", kinds.BUILT_IN)
 def test_kinds_of_kinefit_keep_the_rules_of_plugins(table):
-    kind = kinds.kind_of(table)
+    kind = kinds.KINDS.get(table)
     assert kind.table == table and issubclass(kind.entry, kinds.TakeEntry) and kind.summary and kind.plugin is None
 
 

@@ -22,6 +22,10 @@ from kinefit.observations import SensorRecording as SensorRecording
 from kinefit.readers.take.kinds import Proposal as Proposal, SensorKind as SensorKind, TakeEntry as TakeEntry
 from kinefit.sensors.scene import Scene as Scene
 
+# Formats of one's own
+from kinefit.batch.results import MotionFormat as MotionFormat
+from kinefit.readers.plugins import FileFormat as FileFormat
+
 # From a recording to a motion
 from kinefit.batch.many import track_takes as track_takes
 from kinefit.takes.missing import find_cameras as find_cameras

@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from kinefit.batch.results import NAMES
+from kinefit.batch.results import FORMATS
 from kinefit.bodies import catalogue, load_body
 from kinefit.bodies.toml import records
 from kinefit.bodies.toml.bodies import JOINT_TYPES
@@ -93,7 +93,7 @@ def test_bodies_joints_and_keypoint_sets_are_those_that_exist():
 
 def test_all_formats_and_tables_are_told():
     told = " ".join(cells[1] for cells in rows(FILES.split("## The motion file")[0]).values())
-    assert set(re.findall(r"`(\w+)`", told)) == set(NAMES)
+    assert set(re.findall(r"`(\w+)`", told)) == set(FORMATS.built_in)
     motion = cut(squat_and_wave(), 0, 2)
     assert set(rows(section(FILES, "## Tables"))) == set(tables(motion))
 

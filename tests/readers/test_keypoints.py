@@ -431,7 +431,7 @@ def test_files_of_other_programs_are_said_for_what_they_are(tmp_path, name):
             read_keypoints(path, format=format, camera="c", rate=30.0)
         assert caught.value.file == path and "pose_keypoints_2d" in caught.value.remedy
     what = caught.value.problem.removesuffix(", which are not read")
-    assert find_keypoints([path])[1] == [f"{name}: {what}; not used. {SPLIT}"]
+    assert find_keypoints([path], [])[1] == [f"{name}: {what}; not used. {SPLIT}"]
 
 
 def test_alphapose_s_results_beside_a_video(data_dir):

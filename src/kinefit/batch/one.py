@@ -13,7 +13,7 @@ import msgspec
 
 from kinefit._files import regular
 from kinefit.batch.processes import progress
-from kinefit.batch.results import DEFAULT_FORMATS, Step, write_overlays, write_results
+from kinefit.batch.results import DEFAULT_FORMATS, FORMATS, Step, check_formats, write_overlays, write_results
 from kinefit.batch.summary import DONE, RECORD, Range, Row, failed, write_people_report
 from kinefit.errors import KinefitError, TakeError, printable
 from kinefit.findings import of_provenance
@@ -30,7 +30,7 @@ class Choices:
 
     Parameters
     ----------
-    formats : of `results.NAMES`
+    formats : names of `FORMATS`
     overlays : bool, whether overlay videos are written
     overlay_skin : bool, whether they show the person's skin, too
     report : bool, whether report.html is written
@@ -83,11 +83,12 @@ def asked_take(path: Path, choices: Choices) -> Take:
     Raises
     ------
     KinefitError
-        The take or the named person is invalid.
+        The take or the named person is invalid, or a format cannot be written.
     """
     from kinefit.readers.take.checks import check_enough, check_take
     from kinefit.readers.take.file import read_take
 
+    check_formats(choices.formats)
     take = read_take(path)
     take = replace(take, hide_faces=take.hide_faces or choices.hide_faces)
     if choices.person is not None:
@@ -236,7 +237,8 @@ def work(job: TakeJob) -> tuple[Row, ...]:
             take = asked_take(job.take, job.choices)
         keys = ("subject", "visit", "date", "movement")
         start = msgspec.structs.replace(start, **{key: take.session.stated.get(key, "") for key in keys})
-        key = key_of(take, **asdict(replace(job.choices, restart=False)))
+        exporters = [plugin.code_digest for name in job.choices.formats for plugin in FORMATS.plugins(name)]
+        key = key_of(take, **asdict(replace(job.choices, restart=False)), exporters=exporters)
         complete = not is_uncalibrated(last_found(take))  # whoever deletes found cameras wants others
     except KinefitError as error:
         return (failed(start, str(error)),)

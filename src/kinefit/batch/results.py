@@ -5,9 +5,14 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
+
+from kinefit._files import writing
+from kinefit.errors import ExportError, located
+from kinefit.readers.plugins import PLUGIN_COMMENT, Extension, Extensions
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,17 +27,40 @@ Step = Callable[[str, int, int], None]
 """Called with the name of the work, the number of steps done, and the number of all steps (0: unknown)."""
 
 
-class Format(NamedTuple):
-    """A format of motions: its file or folder among results, its use, and what may be chosen of it, defaults first."""
+@dataclass(frozen=True)
+class MotionFormat(Extension):
+    """A format in which motions are written.
+
+    Parameters
+    ----------
+    file : its file among results, "motion.dae"; of kinefit's own formats also a folder
+    write : (motion, path, **options) -> None; writes a `Motion` to a path with the ending of `file`, which is that of
+        the result once the function has returned
+    unit, up, names, rest : values of the option of that name, the default first; none: `write` has no such option
+    why : reason for which there is no more choice
+    """
 
     file: str
-    use: str
+    write: Callable[..., None]
     unit: tuple[str, ...] = ()
     up: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
     rest: tuple[str, ...] = ()
-    why: str = ""  # there is no more choice
+    why: str = field(default="", kw_only=True)
 
+    @property
+    def ending(self) -> str:
+        """End of the names of its files, ".bvh"; "" if it is a folder."""
+        return Path(self.file).suffix
+
+    def fault(self, name: str) -> str:
+        """A file without an ending, or in a folder."""
+        named = self.ending and Path(self.file).name == self.file
+        return "" if named else f"has the file {self.file!r}, not a name with an ending such as 'motion.dae'"
+
+
+OPTIONS = ("unit", "up", "names", "rest")
+"""Options of formats."""
 
 _UNITS, _RESTS, _UPS = ("m", "cm", "mm"), ("body", "t"), ("x", "y", "z", "-x", "-y", "-z")
 _Y_UPS, _Z_UPS = ("y", "x", "z", *_UPS[3:]), ("z", "x", "y", *_UPS[3:])
@@ -40,58 +68,104 @@ _JOINTS = ("kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh")
 _BVH, _HANIM = ((first, *(name for name in _JOINTS if name != first)) for first in ("bvh", "hanim"))
 _OPENSIM = "OpenSim files are in metres, y up, with the names of the body's coordinates"
 
-FORMATS = {
-    "motion": Format("motion.npz", "all results, for kinefit view, kinefit export and kinefit.read_motion"),
-    "csv": Format("tables", "tables of angles, joint centres, landmarks, quality, residuals", _UNITS, _UPS, _JOINTS),
-    "parquet": Format("tables", "the same tables as Parquet", _UNITS, _UPS, _JOINTS),
-    "bvh": Format("motion.bvh", "animated skeleton for animation programs", ("cm", "m", "mm"), _Y_UPS, _BVH, _RESTS),
-    "glb": Format("motion.glb", "animated figure for browsers and game engines", (), (), _JOINTS, _RESTS,
-                  "GLB is in metres and y up by its specification"),
-    "usd": Format("motion.usdc", "animated figure for film and simulation programs", _UNITS, ("y", "z"), _JOINTS,
-                  _RESTS, "USD supports only y and z up"),
-    "c3d": Format("motion.c3d", "joint centres and landmarks for motion laboratories", ("mm", "cm", "m"), _UPS,
-                  _JOINTS),
-    "trc": Format("motion.trc", "landmarks over time for OpenSim", _UNITS, _Y_UPS, (), (),
-                  "TRC has landmarks, with their H-Anim names"),
-    "x3d": Format("motion.x3d", "animated H-Anim figure for browsers and archives", (), (), _HANIM, _RESTS,
-                  "X3D is in metres and y up by its standard"),
-    "nwb": Format("motion.nwb", "joint centres with confidence for neuroscience", (), _UPS, _JOINTS, (),
-                  "kinefit writes NWB in metres"),
-    "mcap": Format("motion.mcap", "joint states and transforms for ROS 2", (), _Z_UPS, _JOINTS, (), "ROS is in metres"),
-    "rrd": Format("motion.rrd", "joints, error bars and angles for the viewer of Rerun", (), _UPS, _JOINTS, (),
-                  "kinefit writes RRD in metres"),
-    "jsonl": Format("motion.jsonl", "poses as JSON lines, as kinefit live sends them; for the Blender add-on", (), _UPS,
-                    (), (), "JSON lines are in metres, with the names of the body's segments"),
-    "mot": Format("motion.mot", "angles over time for OpenSim", why=_OPENSIM),
-    "osim": Format("body.osim", "the fitted body for OpenSim", why=_OPENSIM),
-}  # fmt: skip
-"""All formats of motions; `exporters` has a function `write_NAME` for each."""
 
-NAMES = {name: format.file for name, format in FORMATS.items()}
-"""File or folder of each format in a folder of results."""
+def _own(name: str, file: str, summary: str, *choices: Any, why: str = "") -> tuple[str, MotionFormat]:
+    """Name and record of a format that `exporters.write_NAME` writes; choices of `OPTIONS`."""
+
+    def write(motion: Motion, path: Path, **options: Any) -> None:
+        from kinefit import exporters
+
+        getattr(exporters, f"write_{name}")(motion.body if name == "osim" else motion, path, **options)
+
+    return name, MotionFormat(summary, file, write, *choices, why=why)
+
+
+FORMATS = Extensions("kinefit.exporters", MotionFormat, "format", dict([
+    _own("motion", "motion.npz", "all results, for kinefit view, kinefit export and kinefit.read_motion"),
+    _own("csv", "tables", "tables of angles, joint centres, landmarks, quality, residuals", _UNITS, _UPS, _JOINTS),
+    _own("parquet", "tables", "the same tables as Parquet", _UNITS, _UPS, _JOINTS),
+    _own("bvh", "motion.bvh", "animated skeleton for animation programs", ("cm", "m", "mm"), _Y_UPS, _BVH, _RESTS),
+    _own("glb", "motion.glb", "animated figure for browsers and game engines", (), (), _JOINTS, _RESTS,
+         why="GLB is in metres and y up by its specification"),
+    _own("usd", "motion.usdc", "animated figure for film and simulation programs", _UNITS, ("y", "z"), _JOINTS,
+         _RESTS, why="USD supports only y and z up"),
+    _own("c3d", "motion.c3d", "joint centres and landmarks for motion laboratories", ("mm", "cm", "m"), _UPS,
+         _JOINTS),
+    _own("trc", "motion.trc", "landmarks over time for OpenSim", _UNITS, _Y_UPS,
+         why="TRC has landmarks, with their H-Anim names"),
+    _own("x3d", "motion.x3d", "animated H-Anim figure for browsers and archives", (), (), _HANIM, _RESTS,
+         why="X3D is in metres and y up by its standard"),
+    _own("nwb", "motion.nwb", "joint centres with confidence for neuroscience", (), _UPS, _JOINTS,
+         why="kinefit writes NWB in metres"),
+    _own("mcap", "motion.mcap", "joint states and transforms for ROS 2", (), _Z_UPS, _JOINTS, why="ROS is in metres"),
+    _own("rrd", "motion.rrd", "joints, error bars and angles for the viewer of Rerun", (), _UPS, _JOINTS,
+         why="kinefit writes RRD in metres"),
+    _own("jsonl", "motion.jsonl", "poses as JSON lines, as kinefit live sends them; for the Blender add-on", (), _UPS,
+         why="JSON lines are in metres, with the names of the body's segments"),
+    _own("mot", "motion.mot", "angles over time for OpenSim", why=_OPENSIM),
+    _own("osim", "body.osim", "the fitted body for OpenSim", why=_OPENSIM),
+]))  # fmt: skip
+"""All formats of motions, by name."""
 
 DEFAULT_FORMATS = ("motion", "csv", "bvh", "glb", "trc", "mot", "osim")
 """Formats that are written by default."""
 
-DESCRIPTIONS = {name: format.use for name, format in FORMATS.items()} | {
+_OTHER_RESULTS = {
     "overlays": "videos with the fitted skeleton",
     "montage": "one image of all cameras",
     "report": "results with error bars and findings, as a page for the browser",
 }
-"""Use of each kind of result."""
+
+
+def check_formats(names: Iterable[str]) -> None:
+    """Import formats, before anything is computed.
+
+    Raises
+    ------
+    ExportError
+        A format that there is not.
+    PluginError
+        A plug-in that cannot be imported, or whose file is another format's.
+    """
+    own = {format.file: name for name, format in FORMATS.built_in.items() if not isinstance(format, str)}
+    for name in names:
+        format = FORMATS.get(name, ExportError)
+        if format.plugin is not None and (other := own.setdefault(format.file, name)) != name:
+            raise format.plugin.error(f"writes {format.file}, the file of the format '{other}'")
+
+
+def description(name: str) -> str:
+    """Use of a kind of result, in a line, or the plug-in that writes it, which is not imported."""
+    if plugins := FORMATS.plugins(name):
+        return f"{PLUGIN_COMMENT}{plugins[0].version}"
+    return FORMATS.get(name).summary if name in FORMATS.built_in else _OTHER_RESULTS.get(name, name)
+
+
+def write_format(motion: Motion, name: str, path: Path, **options: Any) -> None:
+    """Write a motion in one of `FORMATS`, with options of its exporter; a plug-in's file appears whole or not at all.
+
+    Raises
+    ------
+    ExportError
+        The system refuses to write it.
+    PluginError
+        A plug-in raises an error, or writes nothing.
+    """
+    format = FORMATS.get(name)
+    if format.plugin is None:
+        format.write(motion, path, **options)
+        return
+    with located(path), writing(path) as temporary:
+        format.call("write", motion, temporary, valid=lambda _: True, what="", **options)
+        if not (temporary.is_file() and temporary.stat().st_size):
+            raise format.plugin.error("wrote nothing", place="`write`")
+
 
 _PACKAGES = ("kinefit", "numpy", "numba", "opencv-python-headless", "av")
 
 
 def silent(*_: object) -> None:
     """Report nothing: in place of a `Step` or a function for sentences."""
-
-
-def write_format(motion: Motion, format: str, path: Path, **options: Any) -> None:
-    """Write a motion in one of `FORMATS`, with options of its exporter."""
-    from kinefit import exporters
-
-    getattr(exporters, f"write_{format}")(motion.body if format == "osim" else motion, path, **options)
 
 
 def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: Step, files: dict[str, Path]) -> None:
@@ -101,8 +175,9 @@ def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: St
     formats = tuple(formats)
     for number, format in enumerate(formats):
         step("results", number, len(formats))
-        write_format(motion, format, folder / NAMES[format])
-        files[format] = folder / NAMES[format]
+        path = folder / FORMATS.get(format).file
+        write_format(motion, format, path)
+        files[format] = path
         for residuals in motion.residuals.values():
             release(residuals.values, residuals.weights, residuals.measured)
     step("results", len(formats), len(formats))
@@ -185,7 +260,7 @@ def write_track_report(
     norms = read_norms(take.session.norms) if take.session.norms else None
     shown = {} if pictures == "none" else take_pictures(motion, take, seen, step)
     step("report", 0, 1)
-    links = {path.relative_to(folder).as_posix(): DESCRIPTIONS.get(name, name) for name, path in files.items()}
+    links = {path.relative_to(folder).as_posix(): description(name) for name, path in files.items()}
     files["report"] = write_report(
         motion, folder / "report.html", rig=seen.rig, pictures=shown, files=links, norms=norms,
         findings=[("warning", f"{note.rstrip('.')}.", "") for note in notes],
@@ -222,6 +297,8 @@ def provenance(take: Take, **more: Any) -> dict[str, Any]:
 
     `more` are further entries, such as smoothing={...} or tracking={...}.
     """
+    from kinefit.readers.take.kinds import plugins_of
+
     out: dict[str, Any] = {
         "kinefit": metadata.version("kinefit"),
         "python": platform.python_version(),
@@ -237,6 +314,8 @@ def provenance(take: Take, **more: Any) -> dict[str, Any]:
          "time_offset": c.time_offset}
         for c in take.cameras
     ]  # fmt: skip
+    if plugins := plugins_of(take):
+        out["plugins"] = [plugin.version for plugin in plugins]
     out["keypoints"] = [
         {"camera": k.camera, "file": k.file.name if k.file else None, "format": k.format, "set": k.set,
          "accuracy": k.sigma}

@@ -20,7 +20,8 @@ import click
 
 from kinefit import __version__
 from kinefit.batch.results import Step
-from kinefit.errors import ExportError, KinefitError
+from kinefit.errors import ExportError, KinefitError, choices
+from kinefit.readers.plugins import install
 from kinefit.serving import TOKEN_VARIABLE
 
 if TYPE_CHECKING:
@@ -283,10 +284,10 @@ class CommandGroup(click.Group):
 
 def no_format(name: str, valid: Iterable[str]) -> str:
     """What to say of a format that there is not."""
-    problem = f"no format '{name}'; there are: {', '.join(valid)}"
+    problem = choices("format", name, valid)
     if name.lower().strip(".") == "fbx":
-        problem += ". kinefit does not write FBX: use glb or bvh, which Blender, Unity and Unreal import"
-    return problem
+        return f"{problem}. kinefit does not write FBX: use glb or bvh, which Blender, Unity and Unreal import"
+    return f"{problem}. {install('format')}"
 
 
 def check_folder(folder: Path, option: str = "--out") -> None:

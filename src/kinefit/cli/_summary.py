@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kinefit.batch.results import DESCRIPTIONS
+from kinefit.batch.results import description
 from kinefit.cli._screen import print_table, say
 from kinefit.findings import frame_ranges
 
@@ -80,7 +80,7 @@ def print_files(files: Mapping[str, Path]) -> None:
     say("\nWritten:")
     width = max((len(str(path)) for path in files.values()), default=0)
     for format, path in files.items():
-        say(f"  {path!s:<{width}}  {DESCRIPTIONS[format]}")
+        say(f"  {path!s:<{width}}  {description(format)}")
 
 
 def lost_segments(motion: Motion) -> dict[str, NDArray]:

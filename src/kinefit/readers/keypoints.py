@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import read_bytes, read_npy, read_table
-from kinefit.errors import FileError, ObservationError, check_choice, choices, names_file
+from kinefit._mapped import kept
+from kinefit.errors import FileError, ObservationError, choices, names_file
 from kinefit.observations import Keypoints
+from kinefit.observations.arrays import sealed
 from kinefit.readers import keypoint_sets
 from kinefit.readers.keypoint_sets import (
     FACE_POINTS,
@@ -29,6 +31,7 @@ from kinefit.readers.keypoint_sets import (
     keypoint_names,
     keypoint_record,
 )
+from kinefit.readers.plugins import KEYPOINTS, FileFormat
 
 if TYPE_CHECKING:
     from kinefit.geometry.camera import ImageFrame
@@ -229,42 +232,55 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
 
 
 @checked
-def read_keypoints(path: str | PathLike[str], *, format: str | None = None, **options: Any) -> Keypoints:
+@names_file
+def read_keypoints(
+    path: str | PathLike[str], *, format: str | None = None, camera: str, rate: float | None = None,
+    time_offset: float = 0.0, image_frame: ImageFrame | None = None, **options: Any,
+) -> Keypoints:  # fmt: skip
     """Read one camera's keypoints of any format.
 
     Parameters
     ----------
     path : path
-    format : "openpose", "mediapipe" or "caliscope", optional
-        Default: a folder is OpenPose's, a .npy file MediaPipe's. Of caliscope the port of the camera's last number.
+    format : "openpose", "mediapipe", "caliscope" or a plug-in's, optional
+        Default: a folder is OpenPose's, a .npy file MediaPipe's, another file of the plug-in that recognises it. Of
+        caliscope the port of the camera's last number.
+    camera, rate, time_offset, image_frame
+        As in `read_openpose` and `read_mediapipe`; caliscope's tables state their rate.
     **options
-        Of `read_openpose` or `read_mediapipe`.
+        More of `read_openpose` or `read_mediapipe`.
 
     Raises
     ------
     ObservationError, FileError
         An unknown format; and what those raise.
+    PluginError
+        A plug-in fails.
     """
-    if Path(path).is_file():
-        keypoint_sets.refuse_other_keypoints(Path(path))
-    formats = {"openpose": read_openpose, "mediapipe": read_mediapipe, "caliscope": _caliscope_camera}
-    if format is None:
-        format = "openpose" if Path(path).is_dir() else "mediapipe"
-    check_choice("keypoint format", format, formats, ObservationError, file=path)
-    reader: Any = formats[format]
-    return reader(path, **options)
+    path = Path(path)
+    format = format or KEYPOINTS.name_of(path) or "mediapipe"
+    reader = KEYPOINTS.get(format, ObservationError)
+    if reader.plugin is None and path.is_file():
+        keypoint_sets.refuse_other_keypoints(path)
+    record: Keypoints = reader.call(
+        "read", path, camera=camera, rate=rate, **options, what=f"Keypoints of the camera '{camera}' at {rate} Hz",
+        valid=lambda one: isinstance(one, Keypoints) and one.camera == camera and rate in (None, one.rate),
+    )  # fmt: skip
+    points = record.points if image_frame is None else sealed(kept(image_frame.to_calibration(record.points)))
+    return replace(record, points=points, time_offset=record.time_offset + time_offset)
+
+
+def _is_caliscope(path: Path) -> bool:
+    return path.suffix.lower() == ".csv" and b"sync_index" in read_bytes(path, 4096)
 
 
 @names_file
-def _caliscope_camera(
-    path: Path, *, camera: str, rate: float, time_offset: float = 0.0, image_frame: ImageFrame | None = None
-) -> Keypoints:
+def _caliscope_camera(path: Path, *, camera: str, rate: float | None) -> Keypoints:
     ports, numbers = read_caliscope_csv(path, rate=rate), re.findall(r"\d+", camera)
     port = ports.get(f"cam_{int(numbers[-1][-18:])}" if numbers else "")
     if port is None:
         raise ObservationError(choices("camera in this table named", camera, ports))
-    points = port.points if image_frame is None else image_frame.to_calibration(port.points)
-    return replace(port, camera=camera, points=points, time_offset=time_offset)
+    return replace(port, camera=camera)
 
 
 def _numbered_files(folder: Path) -> list[Path]:
@@ -331,3 +347,10 @@ def _numbers(people: list[OpenPosePerson], path: Path, keypoint_set: str) -> NDA
     if not np.isfinite(data).all():
         raise ObservationError("numbers too large", file=path, remedy="Run the detector again on this frame.")
     return data
+
+
+OPENPOSE = FileFormat("OpenPose (Cao et al. 2021, IEEE TPAMI 43:172)", (), read_openpose, Path.is_dir)
+MEDIAPIPE = FileFormat("MediaPipe Pose (Bazarevsky et al. 2020, BlazePose)", (".npy",), read_mediapipe)
+CALISCOPE = FileFormat(
+    "the landmarks that Caliscope recorded", (".csv",), _caliscope_camera, _is_caliscope, has_all_cameras=True
+)

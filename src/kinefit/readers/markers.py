@@ -1,4 +1,4 @@
-"""Read marker recordings, C3D and TRC, in metres."""
+"""Read marker recordings, C3D and TRC, in metres; other formats by plug-ins."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from kinefit._files import metres_of, read_bytes
 from kinefit.errors import FileError, ObservationError, names_file, shortened
 from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
+from kinefit.readers.plugins import MARKERS, FileFormat
 
 _MAX_NEAR_ORIGIN = 0.01  # [m] from the origin, of a person in metres that are read as millimetres
 _COMPUTED_POINTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # of a C3D: no positions
@@ -31,7 +32,7 @@ _TRC_REMEDY = "Expected: PathFileType, names and values of DataRate NumFrames Nu
 @checked
 @names_file
 def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Markers:
-    """Read a C3D or TRC file; its content decides which.
+    """Read a C3D or TRC file, or one of a plug-in's format; its content decides which.
 
     Parameters
     ----------
@@ -53,13 +54,23 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
     ObservationError
         No or unknown unit, or two in one file; no marker, or none visible in any frame; a rate that contradicts the
         times.
+    PluginError
+        A plug-in fails.
     """
-    path, head = Path(path), read_bytes(Path(path), 64)
-    if head[1:2] == b"\x50" or path.suffix.lower() == ".c3d":
-        return _of_one_unit(_markers_of_c3d(read_c3d(path), path, unit))
-    if head.lstrip(b"\xef\xbb\xbf \t\r\n").lower().startswith(b"pathfiletype") or path.suffix.lower() == ".trc":
-        return _of_one_unit(_read_trc(path, unit))
-    raise FileError("neither C3D nor TRC", remedy="Markers are read from .c3d and .trc files.")
+    name = MARKERS.name_of(path := Path(path))
+    if name is None:
+        raise FileError("neither C3D nor TRC", remedy="Markers are read from .c3d and .trc files, or by a plug-in.")
+    read = MARKERS.get(name).call("read", path, unit=unit, valid=lambda m: isinstance(m, Markers), what="Markers")
+    return _of_one_unit(read)
+
+
+def _is_c3d(path: Path) -> bool:
+    return path.suffix.lower() == ".c3d" or read_bytes(path, 64)[1:2] == b"\x50"
+
+
+def _is_trc(path: Path) -> bool:
+    head = read_bytes(path, 64).lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    return path.suffix.lower() == ".trc" or head.startswith(b"pathfiletype")
 
 
 def _metres(unit: str | None) -> float:
@@ -112,7 +123,8 @@ def _texts(c3d: C3d, key: str) -> list[str]:
     return found
 
 
-def _markers_of_c3d(c3d: C3d, path: Path, unit: str | None) -> Markers:
+def _read_c3d(path: Path, unit: str | None) -> Markers:
+    c3d = read_c3d(path)
     count = c3d.points.shape[1]
     labels = (_texts(c3d, "POINT:LABELS") + [""] * count)[:count]
     computed = {name for kind in _COMPUTED_POINTS for name in _texts(c3d, f"POINT:{kind}")} - {""}
@@ -288,3 +300,7 @@ def _trc_rows(lines: list[str], ended: bool, count: int) -> tuple[NDArray, NDArr
     if not np.isfinite(table[:, :2]).all():
         raise FileError("a row without frame number or time", remedy=_TRC_REMEDY)
     return table[:, 0], table[:, 1], table[:, 2:].reshape(len(rows), count, 3)
+
+
+C3D = FileFormat("C3D", (".c3d",), _read_c3d, _is_c3d)
+TRC = FileFormat("TRC of OpenSim", (".trc",), _read_trc, _is_trc)

@@ -7,7 +7,7 @@ from tests.exporters.test_opensim import poses_by_opensim, read_mot
 from kinefit import Markers, read_markers, read_motion
 from kinefit.bodies import PointSet
 from kinefit.bodies.marker_sets import placement
-from kinefit.cli.markers._fit import FORMATS, fit_file
+from kinefit.cli.markers._fit import WRITTEN, fit_file
 from kinefit.errors import ExportError, FileError
 from kinefit.exporters import write_markers
 from kinefit.geometry import se3
@@ -32,7 +32,7 @@ def test_every_person_has_a_folder(two_people, tmp_path):
     found = fit_file(two_people, out=tmp_path)
     assert list(found) == ["Anna", "Bob"]
     for person, (motion, files) in found.items():
-        assert set(files) == set(FORMATS)
+        assert set(files) == set(WRITTEN)
         assert all(path.is_file() and path.parent == tmp_path / person for path in files.values())
         assert len(read_motion(files["motion"])) == len(motion) == 60
         assert motion.up == "z"

@@ -65,11 +65,11 @@ EXTRAS = {"nwb": "ndx_pose", "mcap": "mcap_ros2", "rrd": "rerun"}
 
 
 def test_every_choice_that_help_lists_is_one_of_the_exporter(file):
-    from kinefit.cli.motions.simulate import FREEDOM
+    from kinefit.batch.results import FORMATS, OPTIONS
 
-    for format, free in FREEDOM.items():
-        for key in ("unit", "up", "names", "rest"):
-            for value in getattr(free, key):
+    for format in FORMATS.built_in:
+        for key in OPTIONS:
+            for value in getattr(FORMATS.get(format), key):
                 absent = format in EXTRAS and find_spec(EXTRAS[format]) is None
                 if format not in ("parquet", "csv", "usd") and not absent:
                     told = run("export", file, "--to", format, f"--{key}", value, "--out", file.parent / f"x.{format}")

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from tests.cli.stopping import STOPPABLE
 
 import kinefit
-from kinefit.batch.results import DEFAULT_FORMATS, NAMES
+from kinefit.batch.results import DEFAULT_FORMATS, FORMATS
 from kinefit.cli import main
 from kinefit.cli._summary import bone_lengths
 from kinefit.errors import ObservationError
@@ -41,7 +41,7 @@ def test_a_take_becomes_a_folder_of_results(take):
     overlays = {f"overlays/cam0{c}.mp4" for c in (1, 2, 3, 4)}
     tables = {f"tables/{name}.csv" for name in ("angles", "joints", "landmarks", "quality", "residuals")}
     files = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
-    single = {NAMES[name] for name in DEFAULT_FORMATS if name != "csv"} | {"montage.png", "report.html"}
+    single = {FORMATS.get(name).file for name in DEFAULT_FORMATS if name != "csv"} | {"montage.png", "report.html"}
     assert files == single | tables | overlays
     motion = kinefit.read_motion(out / "motion.npz")
     assert len(motion) == 60
@@ -53,7 +53,7 @@ def test_a_take_becomes_a_folder_of_results(take):
         median = np.nanmedian(residuals.norms)
         assert re.search(rf"^{camera} +{median:.1f} px .* {residuals.swapped.sum()} frames", told.stdout, re.M)
     assert "left_foot_index" in told.stdout  # -v
-    assert all(str(out / NAMES[name]) in told.stdout for name in DEFAULT_FORMATS)
+    assert all(str(out / FORMATS.get(name).file) in told.stdout for name in DEFAULT_FORMATS)
 
 
 def test_faults_of_the_inputs_stand_on_top_of_summary_and_report(take, tmp_path, change):

@@ -27,7 +27,7 @@ from kinefit.app.pages.shell import (
 from kinefit.app.review import Review
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
-from kinefit.batch.results import DESCRIPTIONS, NAMES, write_format
+from kinefit.batch.results import FORMATS, description, write_format
 from kinefit.batch.viewed import is_outdated
 from kinefit.errors import KinefitError
 from kinefit.exporters.report.moments import Moment, doubtful_moments
@@ -290,15 +290,15 @@ class _ResultPage:
         t = self._t
 
         async def write(format: str) -> None:
-            file = self._review.folder / NAMES[format]
             with notified():
+                file = self._review.folder / FORMATS.get(format).file
                 await in_thread(write_format, self._review.motion, format, file)
                 ui.notify(t("result.export_done", file=file), type="positive", timeout=10_000)
 
         with ui.row():
-            for format in NAMES:
+            for format in FORMATS.names():
                 button = ui.button(format, on_click=lambda format=format: write(format)).props("outline no-caps")
-                button.tooltip(DESCRIPTIONS[format])
+                button.tooltip(description(format))
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kinefit.batch import results
+from kinefit.batch.results import FORMATS, check_formats, write_results
 from kinefit.bodies import Body, PointSet, load_body
 from kinefit.bodies.marker_sets import bare, find_marker_set, load_marker_set, matched, read_sides
 from kinefit.cli import _screen
 from kinefit.cli._screen import Step, check_file, note
-from kinefit.errors import ExportError, KinefitError, ObservationError, located
+from kinefit.errors import KinefitError, ObservationError, located
 from kinefit.exporters.skeletons.common import plain_names
 from kinefit.findings import FINDINGS, Finding, as_records, faults_of
 from kinefit.identification.model.from_frame import model_from_frame
@@ -200,7 +200,7 @@ def check_labels(markers: Markers, marker_set: str | None) -> list[Finding]:
     return found
 
 
-FORMATS = ("motion", "mot", "osim", "trc", "bvh", "glb", "markers")
+WRITTEN = ("motion", "mot", "osim", "trc", "bvh", "glb", "markers")
 """Formats that are written where none are named."""
 
 _MARKERS = "markers.trc"  # what was measured, in OpenSim's world: with body.osim and its marker set, IK runs there too
@@ -236,7 +236,7 @@ class MarkerFitOptions:
 
 def fit_file(
     path: Path, out: Path | None = None, options: MarkerFitOptions | None = None, *, unit: str | None = None,
-    formats: Iterable[str] = FORMATS, step: Step | None = None, notes: list[Finding] | None = None,
+    formats: Iterable[str] = WRITTEN, step: Step | None = None, notes: list[Finding] | None = None,
 ) -> dict[str, tuple[Motion, dict[str, Path]]]:  # fmt: skip
     """Fit a file of labelled markers and write what was found.
 
@@ -245,7 +245,7 @@ def fit_file(
     path : C3D or TRC file with labels; several people bear their names as prefixes ("Anna:LASI").
     out : folder, default beside the file: NAME-kinefit; with several people one folder for each in it.
     unit : str, optional, of files that state none or a wrong one.
-    formats : names of `results.NAMES`, and "markers" for the measured ones as OpenSim takes them.
+    formats : names of `FORMATS`, and "markers" for the measured ones as OpenSim takes them.
     step : (what, done, total) -> None, called as the fit advances.
     notes : filled with what is to be said about labels, once for each person.
 
@@ -267,9 +267,7 @@ def fit_file(
 
     step, formats, options = step or (lambda what, done, total: None), tuple(formats), options or MarkerFitOptions()
     folder = out if out is not None else path.with_name(f"{path.stem}-kinefit")
-    unknown = [name for name in formats if name not in (*results.NAMES, "markers")]
-    if unknown:
-        raise ExportError(_screen.no_format(unknown[0], (*results.NAMES, "markers")), remedy="Correct --formats.")
+    check_formats(name for name in formats if name != "markers")
     _screen.check_folder(folder)
     generic = load_body(options.body)
     people = read_people(path, unit, options.sides)
@@ -298,13 +296,13 @@ def fit_file(
         own = folder / person if len(people) > 1 else folder
         worn = worn_body(subject, markers.names)
         plain = [name for name in formats if name not in ("markers", "osim", "trc")]
-        results.write_results(motion, own, plain, step, files)
+        write_results(motion, own, plain, step, files)
         if "trc" in formats:
-            write_trc(motion, own / results.NAMES["trc"], worn.landmarks)  # the points of body.osim
-            files["trc"] = own / results.NAMES["trc"]
+            write_trc(motion, own / FORMATS.get("trc").file, worn.landmarks)  # the points of body.osim
+            files["trc"] = own / FORMATS.get("trc").file
         if "osim" in formats:
-            write_osim(worn, own / results.NAMES["osim"])
-            files["osim"] = own / results.NAMES["osim"]
+            write_osim(worn, own / FORMATS.get("osim").file)
+            files["osim"] = own / FORMATS.get("osim").file
         if "markers" in formats:
             R = rotation_between_up(motion.up, "y")
             names, x = tuple(plain_names(markers.names)), markers.positions @ R.T  # the names that body.osim has

@@ -192,10 +192,10 @@ def fit(
 ) -> None:  # fmt: skip
     """Fit a body to markers: size and marker offsets from all frames, then joint angles."""
     from kinefit.cli._summary import print_summary
-    from kinefit.cli.markers._fit import FORMATS, MarkerFitOptions, fit_file, identify_file
+    from kinefit.cli.markers._fit import WRITTEN, MarkerFitOptions, fit_file, identify_file
 
     out = out or take.with_name(f"{take.stem}-kinefit")
-    chosen = FORMATS if formats is None else tuple(part.strip().lower() for part in formats.split(",") if part.strip())
+    chosen = WRITTEN if formats is None else tuple(part.strip().lower() for part in formats.split(",") if part.strip())
     _screen.check_folder(out)
     with _screen.bars() as step:
         source = take

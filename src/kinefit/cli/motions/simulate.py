@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kinefit.batch import results
+from kinefit.batch.results import FORMATS, OPTIONS, description, write_format
 from kinefit.cli import _screen
 from kinefit.errors import spelled
 
@@ -17,12 +17,17 @@ if TYPE_CHECKING:
     from kinefit.motion import Motion
     from kinefit.observations.recordings import SkeletonMotion
 
-FREEDOM = {name: format for name, format in results.FORMATS.items() if name != "motion"}
-"""Choices of every format."""
+NAMES = tuple(name for name in FORMATS.names() if name != "motion")
+"""Formats into which a motion file can be written."""
 
-KEYS = ("unit", "up", "names", "rest")
 
-_ENDINGS = {"csv": "-tables", "parquet": "-tables", "usd": ".usdc"}
+def _choices(format: str) -> str:
+    """The values of a format's options, or the plug-in that has them."""
+    if FORMATS.plugins(format):
+        return description(format)
+    stated = {key: getattr(FORMATS.get(format), key) for key in OPTIONS}
+    return "; ".join(f"--{key} {' '.join(values)}" for key, values in stated.items() if values) or "none"
+
 
 _EXAMPLES = """\b
 Examples:
@@ -36,29 +41,23 @@ Examples:
 \b
 Values of each format, default first (csv, parquet, c3d, nwb, rrd, jsonl keep the vertical axis; --names mixamo has
 rest pose t):
-""" + "".join(
-    f"  {format:<8} "
-    + "; ".join(f"--{key} {' '.join(getattr(free, key))}" for key in KEYS if getattr(free, key))
-    + ("none" if not any(getattr(free, key) for key in KEYS) else "")
-    + "\n"
-    for format, free in FREEDOM.items()
-)
+""" + "".join(f"  {format:<8} {_choices(format)}\n" for format in NAMES)
 
 
 def _format(ctx: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
     """A format; where there is none of the name, what would do instead."""
     if value is None:
         return None
-    format = spelled(value, FREEDOM)
-    if format not in FREEDOM:
-        raise click.BadParameter(_screen.no_format(value, FREEDOM))
+    format = spelled(value, NAMES)
+    if format not in NAMES:
+        raise click.BadParameter(_screen.no_format(value, NAMES))
     return format
 
 
 @click.command(short_help="Write a motion file in another format.", epilog=_EXAMPLES)
 @click.argument("motion", type=_screen.PATH)
 @click.option(
-    "--to", "format", callback=_format, metavar=f"[{'|'.join(FREEDOM)}]",
+    "--to", "format", callback=_format, metavar=f"[{'|'.join(NAMES)}]",
     help="Format to write; csv and parquet give a folder of tables. Required without --retarget.",
 )
 @click.option(
@@ -88,24 +87,25 @@ def export(
     if table is not None:
         raise click.UsageError("--names-table needs --retarget CHARACTER, whose joints it names.")
     if format is None:
-        problem = f"Missing option '--to' (or --retarget CHARACTER). Give --to [{'|'.join(FREEDOM)}]."
+        problem = f"Missing option '--to' (or --retarget CHARACTER). Give --to [{'|'.join(NAMES)}]."
         raise click.UsageError(problem)
     if cylinders and format not in ("glb", "usd"):
         raise click.UsageError(f"--cylinders does not apply to {format}: only glb and usd contain a mesh of the body.")
+    chosen = FORMATS.get(format)
     options = {
-        key: _choice(format, key, _meant(key, value, getattr(FREEDOM[format], key)))
+        key: _choice(format, key, _meant(key, value, getattr(chosen, key)))
         for key, value in choices.items() if value is not None
     }  # fmt: skip
     from kinefit.readers.motion import find_motion, read_motion
 
     motion = find_motion(motion)
-    out = out or motion.with_name(f"{motion.stem}{_ENDINGS.get(format, '.' + format)}")
-    (_screen.check_folder if format in ("csv", "parquet") else _screen.check_file)(out)
+    out = out or motion.with_name(f"{motion.stem}{chosen.ending or f'-{chosen.file}'}")
+    (_screen.check_file if chosen.ending else _screen.check_folder)(out)
     recorded = read_motion(motion)
     more = {"cylinders": True} if cylinders else {}
-    results.write_format(recorded, format, out, **options, **more)
+    write_format(recorded, format, out, **options, **more)
     stated = ", ".join([*(f"{key} {value}" for key, value in options.items()), *["cylinders"] * cylinders])
-    _screen.say(f"{out}: {results.DESCRIPTIONS[format]}, {len(recorded)} frames{', ' + stated if stated else ''}")
+    _screen.say(f"{out}: {description(format)}, {len(recorded)} frames{', ' + stated if stated else ''}")
 
 
 def _meant(key: str, value: str, valid: Sequence[str]) -> str:
@@ -140,13 +140,14 @@ def _retarget(motion: Path, character: Path, table: Path | None, out: Path | Non
 
 def _choice(format: str, key: str, value: str) -> str:
     """An option, refused where the format has no freedom for it, with why and what there is."""
-    valid = getattr(FREEDOM[format], key)
+    chosen = FORMATS.get(format)
+    valid = getattr(chosen, key)
     if value in valid:
         return value
-    why = f"{FREEDOM[format].why}. " if FREEDOM[format].why and not (valid and key == "unit") else ""
+    why = f"{chosen.why}. " if chosen.why and not (valid and key == "unit") else ""
     if valid:
         raise click.UsageError(f"{why}--{key} {value} is not possible for {format}. Give one of: {', '.join(valid)}.")
-    others = [name for name, free in FREEDOM.items() if getattr(free, key)]
+    others = [name for name in FORMATS.built_in if getattr(FORMATS.get(name), key)]
     raise click.UsageError(f"{why}--{key} does not apply to {format}, only to {', '.join(others)}.")
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kinefit.batch import results
+from kinefit.batch.results import DEFAULT_FORMATS, FORMATS
 from kinefit.cli import _screen
 
 if TYPE_CHECKING:
@@ -23,8 +23,8 @@ def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -
     """Formats of a list such as "bvh,csv"."""
     formats = tuple(dict.fromkeys(value.lower().replace(",", " ").split()))
     for name in formats:
-        if name not in results.NAMES:
-            raise click.BadParameter(_screen.no_format(name, results.NAMES))
+        if name not in FORMATS.names():
+            raise click.BadParameter(_screen.no_format(name, FORMATS.names()))
     return formats
 
 
@@ -40,9 +40,9 @@ def choices_options(command: Callable) -> Callable:
         click.option("--overlays/--no-overlays", default=True, show_default=True, help="Write videos with the fit."),
         click.option("--overlay-skin", is_flag=True, help="Draw the person's skin on the videos, too."),
         click.option(
-            "--formats", default=",".join(results.DEFAULT_FORMATS), show_default=True, callback=chosen_formats,
+            "--formats", default=",".join(DEFAULT_FORMATS), show_default=True, callback=chosen_formats,
             metavar="LIST",
-            help=f"Formats to write. Others: {', '.join(sorted({*results.NAMES} - {*results.DEFAULT_FORMATS}))}.",
+            help=f"Formats to write. Others: {', '.join(sorted({*FORMATS.names()} - {*DEFAULT_FORMATS}))}.",
         ),
         click.option("--report/--no-report", default=True, show_default=True, help="Write report.html."),
         click.option(

@@ -15,13 +15,9 @@ from kinefit.exporters.report.fit import overall_median, sensor_fits
 from kinefit.exporters.tables import split_side
 from kinefit.findings import listed
 from kinefit.motion import SHOWN_UNITS, Motion
+from kinefit.readers.plugins import KEYPOINTS
 
-_DETECTORS = {
-    "openpose": "OpenPose (Cao et al. 2021, IEEE TPAMI 43:172)",
-    "mediapipe": "MediaPipe Pose (Bazarevsky et al. 2020, BlazePose)",
-    "detect": "MediaPipe's pose networks as kinefit runs them (Bazarevsky et al. 2020, BlazePose)",
-    "caliscope": "the landmarks that Caliscope recorded",
-}  # fmt: skip
+_BUILT_IN_DETECTOR = "MediaPipe's pose networks as kinefit runs them (Bazarevsky et al. 2020, BlazePose)"
 
 
 def methods(motion: Motion, date: str, doubtful: int) -> list[p.Html]:
@@ -125,7 +121,8 @@ def _cameras(provenance: Mapping[str, Any], names: list[str]) -> str:
         return ""
     keypoints = [entry for entry in provenance.get("keypoints", []) if isinstance(entry, Mapping)]
     formats = [(str(e.get("format", "")), e.get("set") or "") for e in keypoints]
-    kinds = dict.fromkeys(f"{_DETECTORS.get(name, name)} {points}".strip() for name, points in formats)
+    summaries = {name: KEYPOINTS.get(name).summary for name in KEYPOINTS.built_in} | {"detect": _BUILT_IN_DETECTOR}
+    kinds = dict.fromkeys(f"{summaries.get(name, name)} {points}".strip() for name, points in formats)
     accuracies = sorted({float(e["accuracy"]) for e in keypoints if isinstance(e.get("accuracy"), int | float)})
     text = f"2D keypoints {f'({listed([k for k in kinds if k], 4)}) ' if any(kinds) else ''}of {listed(names, 12)}"
     stated = f" with a stated standard deviation of {listed([f'{a:g}' for a in accuracies])} px" if accuracies else ""

@@ -15,7 +15,7 @@ import numpy as np
 
 from kinefit._arguments import checked
 from kinefit._files import metres_of, parse_toml, read_bytes, read_text, write_text
-from kinefit.errors import CalibrationError, FileError, located
+from kinefit.errors import CalibrationError, FileError, KinefitError, located, names_file
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
 from kinefit.readers.calibration.colmap import colmap_cameras
@@ -25,6 +25,7 @@ from kinefit.readers.calibration.matlab import matlab_tree, read_mat
 from kinefit.readers.calibration.mocap import qualisys_cameras, vicon_cameras
 from kinefit.readers.calibration.tables import Sizes, camera_from_table, read_table
 from kinefit.readers.calibration.trees import stereo_tables, tables_of
+from kinefit.readers.plugins import CALIBRATIONS
 from kinefit.readers.ros.images import mcap_rig
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.entries import CalibrationEntry
@@ -34,6 +35,8 @@ FORMATS = (
     "Theia3D XML, Vicon .xcp, MATLAB .mat, COLMAP text (cameras.txt and images.txt), Kalibr, MC-Calib, multical, "
     "transforms.json, MCAP of ROS 2"
 )
+SUFFIXES = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt", ".xcp", ".mat")
+"""Ends of the names of files in these formats."""
 MAX_CALIBRATION_BYTES = 2_000_000
 """Largest file of a calibration [bytes]; a camera takes about a thousand."""
 PAIRS = (("intrinsics", "extrinsics"), ("intri", "extri"))
@@ -54,6 +57,7 @@ _MAX_ORIGIN_DISTANCE = 200.0  # [m] a camera farther from the world's origin is 
 
 
 @checked
+@names_file
 def read_calibration(
     path: str | PathLike[str],
     *,
@@ -72,7 +76,7 @@ def read_calibration(
         `matlab`), COLMAP text (the folder), Kalibr's camchain, MC-Calib YAML, multical JSON, transforms.json of
         nerfstudio and instant-ngp, MCAP of ROS 2 (CameraInfo and /tf_static; extra `ros`). Other JSON, YAML and TOML is
         read by the names of its keys (docs/calibration.md). Poses are world to camera unless a key says otherwise. A
-        single camera without a pose becomes the world.
+        single camera without a pose becomes the world. What none of these reads, a plug-in may.
     unit : "auto", "m", "dm", "cm", "mm", "inch" or float [m]
         Unit of length of the file. "auto": as the file states (`unit = "mm"`, alone or under [metadata]), or as its
         format defines (Qualisys, Vicon, FreeMoCap: mm, Panoptic: cm), else metres, an error if that is implausible.
@@ -93,10 +97,24 @@ def read_calibration(
     CalibrationError
         A camera with a missing key, a wrong shape, numbers that are not finite, a wrong unit, or a key that speaks of
         its lens, pose or convention and that kinefit does not read.
+    PluginError
+        A plug-in fails.
     """
     path = Path(path)
     if not path.exists():
         raise FileError("no such file or folder", file=path, remedy="Check the path of the calibration.")
+    try:
+        return _read(path, unit, image_size, exteriors)
+    except KinefitError:
+        if (name := CALIBRATIONS.name_of(path)) is None:
+            raise
+    options = {"unit": unit, "image_size": image_size if callable(image_size) else lambda camera: image_size}
+    valid = lambda rig: isinstance(rig, Rig) and len(rig) > 0
+    return CALIBRATIONS.get(name).call("read", path, **options, valid=valid, what="a Rig")  # type: ignore[no-any-return]
+
+
+def _read(path: Path, unit: str | float, image_size: Sizes | None, exteriors: bool) -> Rig:
+    """The cameras of a calibration in one of kinefit's own formats."""
     if (recording := inside(path)) is not None:
         return mcap_rig(recording[0])
     if path.stem in ("cameras", "images") and path.suffix in (".txt", ".bin"):
@@ -200,8 +218,7 @@ def calibration_sources(path: Path) -> list[tuple[str, list[Path]]]:
 
 
 def _calibration_files(folder: Path) -> list[Path]:
-    endings = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt", ".xcp", ".mat")
-    files = sorted(file for file in folder.iterdir() if file.is_file() and file.name.lower().endswith(endings))
+    files = sorted(file for file in folder.iterdir() if file.is_file() and file.name.lower().endswith(SUFFIXES))
     tables = [file for file in files if file.suffix.lower() not in (".xcp", ".mat")]  # these have other uses, too
     return tables or files
 

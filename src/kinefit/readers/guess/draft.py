@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from kinefit.errors import FileError, printable
+from kinefit.errors import FileError, KinefitError, printable
 from kinefit.readers.guess.files import CalibrationFile
 
 CONFIDENCE_LEVELS = ("sure", "likely", "guess", "open")
@@ -81,6 +81,11 @@ class Draft:
     def note(self, about: str, sure: str, text: str) -> None:
         """Add a remark for the screen."""
         self.notes.append(Note(about, sure, text))
+
+    def note_error(self, about: str, error: KinefitError) -> None:
+        """Add a remark on what is wrong, once."""
+        note = Note(about, "open", f"{error.problem}. {error.remedy or ''}".strip())
+        self.notes += [] if note in self.notes else [note]
 
     def note_value(self, about: str, value: Value, key: str) -> Value:
         """Add a remark on a value for the screen; returns the value."""

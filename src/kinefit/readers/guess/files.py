@@ -17,18 +17,17 @@ from numpy.typing import NDArray
 
 from kinefit._files import npy_header, read_table
 from kinefit._pictures import read_picture
-from kinefit.errors import CalibrationError, FileError, KinefitError
+from kinefit.errors import CalibrationError, FileError, KinefitError, PluginError
 from kinefit.geometry.camera import Rig
-from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, read_calibration
+from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, SUFFIXES, read_calibration
 from kinefit.readers.guess.names import camera_of, natural
 from kinefit.readers.keypoint_sets import SPLIT, other_keypoints
-from kinefit.readers.keypoints import decode_openpose
+from kinefit.readers.keypoints import decode_openpose, read_keypoints
+from kinefit.readers.plugins import CALIBRATIONS, KEYPOINTS, MARKERS
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.video import ENDINGS, ImageFolder, Video
 
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts", ".m2ts", ".ts", ".wmv", ".mxf"}
-CALIBRATIONS = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt", ".xcp", ".mat")
-MARKERS = {".c3d", ".trc"}
 OF_CALIBRATION = re.compile(
     r"(?<![a-z])(?:(?:intrinsic|extrinsic|charuco|checker|chess|calib)\w*|board|wand|int|ext)(?![a-z])", re.IGNORECASE
 )
@@ -127,7 +126,7 @@ def find_calibrations(
 
     Returns
     -------
-    calibrations; files of a single camera; errors of files that are calibrations but cannot be used.
+    calibrations; files of a single camera; errors of files that are calibrations but cannot be used, and of plug-ins.
     """
     found: list[CalibrationFile] = []
     singles: list[Path] = []
@@ -135,7 +134,7 @@ def find_calibrations(
     sizes = partial(_video_size, sorted(videos, key=lambda path: bool(OF_CALIBRATION.search(path.name))), folder)
     detectors = {folder for folder, group in _by_folder(files) if sum(map(_numbered, group)) > _MIN_SEQUENCE}
     for path in files:
-        known = path.name.lower().endswith(CALIBRATIONS) or _is_xml_text(path)
+        known = path.name.lower().endswith(SUFFIXES) or _is_xml_text(path) or CALIBRATIONS.name_of(path, faults)
         if not known or (path.parent in detectors and _numbered(path)):
             continue
         if path.stat().st_size > MAX_CALIBRATION_BYTES:
@@ -213,7 +212,8 @@ def _try(
             if "no camera in it" not in error.problem and (error.place or _CALIBRATION_NAME.search(path.name)):
                 faults.append(error)
             return None
-    except (KinefitError, RecursionError):
+    except (KinefitError, RecursionError) as error:
+        faults += [error] if isinstance(error, PluginError) else []
         return None
     rigs = {unit: read_calibration(path, unit=unit, image_size=size_of) for unit in _UNITS}
     unit = min(rigs, key=lambda u: abs(np.log(_spread(rigs[u]) / 3.0)))  # 3 m from the scene is typical
@@ -267,13 +267,16 @@ def _is_photograph(grey: NDArray) -> bool:
     return float(np.mean((grey > _MASK_TOLERANCE) & (grey < 255 - _MASK_TOLERANCE))) > _MIN_GREY_SHARE
 
 
-def find_markers(files: list[Path]) -> list[Path]:
-    """C3D and TRC files."""
-    return [path for path in files if path.suffix.lower() in MARKERS]
+def find_markers(files: list[Path], faults: list[KinefitError]) -> list[Path]:
+    """Files of markers; errors of plug-ins are added to `faults`."""
+    return [path for path in files if MARKERS.name_of(path, faults)]
 
 
-def find_keypoints(files: list[Path]) -> tuple[list[KeypointFile], list[str]]:
-    """Keypoints of all formats of a take file; and remarks on similar files of unknown formats."""
+def find_keypoints(files: list[Path], faults: list[KinefitError]) -> tuple[list[KeypointFile], list[str]]:
+    """Keypoints of all formats of a take file; remarks on similar files of unknown formats.
+
+    Errors of plug-ins are added to `faults`.
+    """
     found: list[KeypointFile] = []
     remarks: list[str] = []
     for folder, group in _by_folder(files):
@@ -286,11 +289,17 @@ def find_keypoints(files: list[Path]) -> tuple[list[KeypointFile], list[str]]:
         shape = _array_shape(path) if suffix == ".npy" else None
         if shape is not None and len(shape) == 3 and shape[1:] in ((33, 3), (75, 3)):
             found.append(KeypointFile(path, "mediapipe", shape[0], shape[1]))
+        elif suffix == ".csv" and (frames := _caliscope_frames(path)):
+            found.append(KeypointFile(path, "caliscope", frames, 33))
+        elif (format := KEYPOINTS.name_of(path, faults)) and KEYPOINTS.plugins(format):
+            try:
+                record = read_keypoints(path, format=format, camera=path.stem, rate=1.0)
+                found.append(KeypointFile(path, format, len(record), len(record.names)))
+            except KinefitError as error:
+                faults.append(error)
         elif shape is not None and len(shape) >= 3 and shape[-1] in (2, 3):
             known = "landmarks are read as (frames, 33, 3), or (frames, 75, 3) with hands"
             remarks.append(f"{path.name}: an array of shape {shape}; {known}")
-        if suffix == ".csv" and (frames := _caliscope_frames(path)):
-            found.append(KeypointFile(path, "caliscope", frames, 33))
         elif suffix in _MAYBE_KEYPOINTS and (other := other_keypoints(path)):
             remarks.append(f"{path.name}: {other}; not used. {SPLIT}")
     return found, remarks

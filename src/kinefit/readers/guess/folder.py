@@ -19,7 +19,7 @@ from kinefit.readers.guess.names import trials
 from kinefit.readers.markers import read_markers
 from kinefit.readers.ros.images import Shown, mcap_rig, shown
 from kinefit.readers.take.entries import TABLES
-from kinefit.readers.take.kinds import Proposal, kind_names, kind_of, refuse_shadows
+from kinefit.readers.take.kinds import KINDS, Proposal
 
 _CALIBRATE = (
     "Calibrate with a board (kinefit calibrate board) or, if the cameras' intrinsics are known, from the person "
@@ -66,11 +66,14 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
         raise TakeError("no such folder", file=folder, remedy="Name the folder with videos, keypoints and calibration.")
     draft = Draft(folder, Path(beside).absolute() if beside else folder)
     files = guess_files.list_files(folder)
-    videos, markers = guess_files.find_videos(files, folder), guess_files.find_markers(files)
-    keypoints, remarks = guess_files.find_keypoints(files)
+    faults: list[KinefitError] = []
+    videos, markers = guess_files.find_videos(files, folder), guess_files.find_markers(files, faults)
+    keypoints, remarks = guess_files.find_keypoints(files, faults)
     recordings = guess_files.find_recordings(files)
     for remark in remarks:
         draft.note("keypoints", "open", remark)
+    for fault in faults:
+        draft.note_error("files", fault)
     _describe_kinds(draft, files)
     if not (videos or keypoints or markers or recordings or any(draft.tables.values())):
         raise TakeError(
@@ -91,13 +94,13 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
 
 def _describe_kinds(draft: Draft, files: Sequence[Path]) -> None:
     """Enter what kinds of sensors find among files; a plug-in that fails becomes a note."""
-    for table in kind_names():
+    for table in KINDS.names():
         try:
-            refuse_shadows(table, TABLES)
-            kind, valid = kind_of(table), lambda found: all(isinstance(one, Proposal) and one.entry for one in found)
+            KINDS.refuse_shadows(table, TABLES)
+            kind, valid = KINDS.get(table), lambda found: all(isinstance(one, Proposal) and one.entry for one in found)
             found = kind.call("propose", files, valid=valid, what="proposals with an entry") if kind.propose else []
         except PluginError as error:
-            draft.note(table, "open", f"{error.problem}. {error.remedy or ''}".strip())
+            draft.note_error(table, error)
             continue
         for one in found:
             (key, first), *more = one.entry.items()
@@ -113,6 +116,9 @@ def _choose_calibration(
     """The calibration that most files fit; from the parent folder if there is none here; None without one."""
     videos = guess_files.find_videos(files, draft.folder)
     found, singles, faults = guess_files.find_calibrations(files, videos, draft.folder)
+    for error in [fault for fault in faults if isinstance(fault, PluginError)]:
+        draft.note_error("calibration", error)
+        faults.remove(error)
     if not found:
         found = guess_files.find_calibrations(_above(draft.folder), videos, draft.folder)[0]
     if not found and markers:
@@ -248,7 +254,7 @@ def _calibration(draft: Draft, path: Path) -> Rig | None:
     try:
         rig = mcap_rig(path)
     except CalibrationError as error:
-        draft.note("calibration", "open", f"{error.problem}. {error.remedy or ''}".strip())
+        draft.note_error("calibration", error)
         return None
     why = f"{len(rig)} cameras: {', '.join(rig.names)}"
     draft.calibration = CalibrationFile(path, rig), {"file": Value(path, "sure", why)}

@@ -19,6 +19,7 @@ from kinefit.readers.guess.files import STATIC, KeypointFile
 from kinefit.readers.guess.names import Trial, camera_number, common_words, trials
 from kinefit.readers.keypoint_sets import HAND_POINTS, OPENPOSE_HANDS, SET_OF_COUNT, SETS_WITH_HANDS
 from kinefit.readers.keypoints import read_keypoints
+from kinefit.readers.plugins import KEYPOINTS
 from kinefit.readers.video import Video
 
 Size = tuple[int, int]
@@ -303,7 +304,6 @@ def _point(names: Sequence[str], side: str, joint: str) -> int | None:
 Source = dict[str, KeypointFile]  # camera -> its file, of one detector
 
 _AMBIGUOUS_COUNTS = (25, 25 + 2 * HAND_POINTS)  # points of BODY_25 and BODY_25B, without hands and with them
-_FORMATS = ("openpose", "mediapipe", "caliscope")  # the first that is there: its confidence is the most informative
 _MAX_LENGTH_ERROR = 0.1  # share of the video's frames; keypoints with a larger error are of another recording
 
 
@@ -312,12 +312,12 @@ def keypoint_sources(
 ) -> list[Source]:
     """Keypoints of each detector that belong to the videos, by their number of frames (0 without videos) and place."""
     out: list[Source] = []
-    for format in _FORMATS:
+    for format in (name for name in KEYPOINTS.names() if any(k.format == name for k in found)):
         of = {k.path: k for k in found if k.format == format and k.points}
         for k in found:
             if k.format == format and not k.points:
                 draft.note("keypoints", "open", f"{draft.name(k.path)}: no person in any frame, not used")
-        if format == "caliscope":  # one table of all cameras
+        if KEYPOINTS.get(format).has_all_cameras:
             numbered = [name for name in rig.names if camera_number(name) is not None]
             groups = [Trial(dict.fromkeys(numbered, path), "number", draft.name(path)) for path in of]
         else:
@@ -365,7 +365,7 @@ def _read(file: KeypointFile, camera: str) -> Keypoints:
                 file.path, format=file.format, camera=camera, rate=1.0, keypoint_set=OPENPOSE_HANDS
             )
     else:
-        rate = None if file.format == "caliscope" else 1.0
+        rate = None if KEYPOINTS.get(file.format).has_all_cameras else 1.0
         record = read_keypoints(file.path, format=file.format, camera=camera, rate=rate)
     return record
 
@@ -392,7 +392,8 @@ def keypoint_entries(
     if frame is not None:
         draft.note_value(f"keypoints, {format}", frame, "frame")
     for name, record in records.items():
-        entry = {"camera": Value(name), "file": Value(source[name].path), "format": Value(format)}
+        why = KEYPOINTS.get(format).comment if KEYPOINTS.plugins(format) else ""
+        entry = {"camera": Value(name), "file": Value(source[name].path), "format": Value(format, why=why)}
         if format == "openpose":
             of_two = source[name].points in _AMBIGUOUS_COUNTS
             why = f"{source[name].points} points" + ", recognised by the lengths of the bones" * of_two

@@ -13,8 +13,9 @@ from kinefit.motion import UP_AXES
 from kinefit.observations.recordings import PersonChoice
 from kinefit.readers.depth.images import listed
 from kinefit.readers.keypoint_sets import FACE_SET
+from kinefit.readers.plugins import KEYPOINTS
 from kinefit.readers.ros.recordings import inside
-from kinefit.readers.take.entries import SINGLE_TABLES, Take, keys_of
+from kinefit.readers.take.entries import NO_FILES, SINGLE_TABLES, Take, keys_of
 
 ONE_CAMERA = "keypoints of one camera do not give a person's distance; two cameras do, or one with depth or markers"
 
@@ -172,7 +173,7 @@ def _files_of_two(take: Take) -> _Odd:
             yield "the same file twice", str(one[0]), "Remove one: a file named twice would count twice."
     of_one = [(f"camera {c.name}", c.name, c.video) for c in take.cameras if c.video is not None]
     of_one += [(f"keypoints of camera {k.camera}", k.camera, k.file) for k in take.keypoints
-               if k.file is not None and k.format != "caliscope"]  # fmt: skip
+               if k.file is not None and (k.format in NO_FILES or not KEYPOINTS.get(k.format).has_all_cameras)]
     for place, camera, file in of_one:
         others = [other for _, other, same in of_one if same == file and other != camera]
         if others:

@@ -23,7 +23,8 @@ from kinefit.errors import choices, located
 from kinefit.geometry import se3
 from kinefit.observations import KEYPOINT_SIGMA
 from kinefit.readers.keypoint_sets import FACE_SET, KEYPOINT_SETS, MEDIAPIPE_SETS
-from kinefit.readers.take.kinds import TakeEntry, kind_of, refuse
+from kinefit.readers.plugins import KEYPOINTS
+from kinefit.readers.take.kinds import KINDS, TakeEntry, refuse
 
 _Read = TypeVar("_Read")
 Pixels = Annotated[float, Meta(gt=0, lt=1e4, description="Give a positive number of pixels.")]
@@ -51,6 +52,9 @@ _Counted = Annotated[
 
 SKIN_SETS = ("HANDS", "WRISTS")
 """Which points of the body the skin's patches are: middles of the hands, or wrists of a body without fingers."""
+
+NO_FILES = ("detect", "skin")
+"""Formats of `[[keypoints]]` that are computed from videos, besides those of files."""
 
 RENAMED: dict[str, dict[str, str]] = {
     table: {"accuracy": "sigma"} for table in ("keypoints", "silhouette", "markers", "depth", "stereo")
@@ -133,7 +137,7 @@ class KeypointsEntry(TakeEntry, frozen=True, kw_only=True):
     camera: str
     file: Path | None = None  # or folder; default, of "detect" only: what `kinefit detect` leaves beside the take
     stream: Path | None = None  # of `kinefit live`, in place of a file: a folder that OpenPose's JSON files come into
-    format: Literal["openpose", "mediapipe", "caliscope", "detect", "skin"] = "openpose"
+    format: str = "openpose"  # of `KEYPOINTS`, or "detect" or "skin"
     set: str | None = None  # default: BODY_25B of openpose, MEDIAPIPE_33 of mediapipe, HANDS of skin
     frame: Literal["calibration", "video"] | None = None  # image frame of the coordinates; needed where the two differ
     rate: Rate | None = None  # [Hz]; default: the camera's video, or the take
@@ -144,17 +148,17 @@ class KeypointsEntry(TakeEntry, frozen=True, kw_only=True):
     face: tuple[float, float, _Length, _Length] | None = None  # [px] of "skin": left, top, width, height in the video
 
     def __post_init__(self) -> None:
-        files = ("openpose", "mediapipe", "caliscope")
+        files, own = KEYPOINTS.names(), (*KEYPOINTS.built_in, *NO_FILES)
         self._uses(self.format, {
             "file": (*files, "detect"), "frame": files, "rate": files, "face": ("skin",), "stream": ("openpose",),
-            "excluded": (*files, "detect"), "swapped": (*files, "detect"),
+            "excluded": (*files, "detect"), "swapped": (*files, "detect"), "set": own,
         })  # fmt: skip
         sets = {"openpose": tuple(KEYPOINT_SETS), "skin": SKIN_SETS, "detect": (*MEDIAPIPE_SETS, FACE_SET)}
         known = sets.get(self.format, MEDIAPIPE_SETS)
         kind = "keypoint set" if self.format == "openpose" else f"keypoint set of {self.format}"
         odd = self.set is not None and self.set not in known
         refuse(odd, choices(kind, str(self.set), known), f'Use set = "{known[0]}", or remove it.')
-        none = self.file is None and self.stream is None and self.format not in ("detect", "skin")
+        none = self.file is None and self.stream is None and self.format not in NO_FILES
         refuse(none, f"no file of {self.format} keypoints", 'Write file = "...", or format = "detect".')
         self._ordered("frames", "excluded", "swapped")
         if self.stream is not None:
@@ -391,7 +395,7 @@ SINGLE_TABLES = ("take", "session", "start", "calibration")
 
 def entry_class(table: str) -> type[Any]:
     """The record of a table's entries."""
-    return TABLES.get(table) or kind_of(table).entry
+    return TABLES.get(table) or KINDS.get(table).entry
 
 
 def keys_of(table: str) -> tuple[str, ...]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from os import PathLike
@@ -27,11 +26,13 @@ from kinefit.errors import (
     printable,
     shortened,
 )
-from kinefit.readers.guess.files import MARKERS, VIDEOS
+from kinefit.readers.guess.files import VIDEOS
+from kinefit.readers.plugins import KEYPOINTS, MARKERS, install
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
     ATTRIBUTES,
+    NO_FILES,
     RENAMED,
     SINGLE_TABLES,
     TABLES,
@@ -39,13 +40,7 @@ from kinefit.readers.take.entries import (
     entry_class,
     keys_of,
 )
-from kinefit.readers.take.kinds import (
-    BUILT_IN,
-    PLUGIN_COMMENT,
-    WrongEntryError,
-    kind_names,
-    refuse_shadows,
-)
+from kinefit.readers.take.kinds import BUILT_IN, KINDS, WrongEntryError
 
 __all__ = ["Take", "read_take"]
 
@@ -72,7 +67,7 @@ def read_take(path: str | PathLike[str]) -> Take:
     head["name"] = head.get("name") or printable(path.stem)
     if isinstance(body := head.get("body"), str) and body.endswith((".toml", ".npz")):
         head["body"] = str(path.parent / body)
-    of_kinds = {table: entry_class(table) for table in kind_names() if table in raw}
+    of_kinds = {table: entry_class(table) for table in KINDS.names() if table in raw}
     head["sensors"] = {t: _converted({t: raw.pop(t)}, tuple[of_kinds[t], ...], path, t) for t in of_kinds}  # type: ignore
     take: Take = _converted(head | {ATTRIBUTES.get(table, table): rows for table, rows in raw.items()}, Take, path)
     check_take(take)
@@ -111,9 +106,9 @@ def _tidy(raw: dict[str, Any], path: Path, text: str) -> None:
     """Name an unknown table or key, and what exists; put new names of keys, metres and topics in place."""
     for table, content in raw.items():
         with located(path, f"[{table}]"):
-            remedy = None if table in TABLES else _plugin_for(table, text)
-            check_choice("sensor or table", table, [*TABLES, *kind_names()], TakeError, remedy=remedy)
-            refuse_shadows(table, TABLES)
+            remedy = install("table", rf"\[\[{re.escape(table)}\]\]", text)
+            check_choice("sensor or table", table, [*TABLES, *KINDS.names()], TakeError, remedy=remedy)
+            KINDS.refuse_shadows(table, TABLES)
         many = table not in SINGLE_TABLES
         if many != isinstance(content, list):
             wanted = f"[[{table}]]" if many else f"[{table}]"
@@ -126,15 +121,11 @@ def _tidy(raw: dict[str, Any], path: Path, text: str) -> None:
                 for key, units in (("unit", LENGTHS), ("time_unit", TIMES)) if table == "depth" else ():
                     if (value := worth(row.get(key), units)) is not None:
                         row[key] = value
+                if table == "keypoints" and isinstance(format := row.get("format"), str) and format not in NO_FILES:
+                    remedy = install(KEYPOINTS.what, rf'format *= *"{re.escape(format)}"', text)
+                    KEYPOINTS.get(format, TakeError, remedy=remedy)
                 if isinstance(topic := row.get("topic"), str):
                     _name_topic(topic, row, "video" if table == "camera" else "file", path)
-
-
-def _plugin_for(table: str, text: str) -> str:
-    """What to install for a table of a plug-in: the distribution that `kinefit init` wrote beside the table's name."""
-    noted = re.search(rf"^\[\[{re.escape(table)}\]\]\s*#\s*{PLUGIN_COMMENT}(\S+)", text, re.MULTILINE)
-    what = noted[1] if noted else "the package that reads it"
-    return f"Correct the name, or install the plug-in that reads [[{table}]]: {sys.executable} -m pip install {what}."
 
 
 def _rename(table: str, row: dict[str, Any], path: Path, place: str) -> None:
@@ -193,7 +184,7 @@ def find_take(path: str | PathLike[str], *, wanted: Sequence[str] = ("track",)) 
         what = first if there is None else f"Use the take file next to it: {command(*wanted, there)}."
         remedy = f"{what} For keypoints of this video alone: {command('detect', path)}"
         raise FileError("a video, not a take file", file=path, remedy=remedy)
-    if kind in MARKERS:
+    if any(kind in MARKERS.get(name).suffixes for name in MARKERS.built_in):
         raise FileError("a marker file, not a take file", file=path, remedy=f"Run: {command('markers', 'fit', path)}")
     if kind == ".npz":
         raise FileError("a motion, not a take file", file=path, remedy=f"Look at it: {command('view', path)}")
@@ -213,7 +204,7 @@ def is_take(file: Path) -> bool:
         tables = parse_toml(read_text(file, "it", remedy=""), file)
     except KinefitError:
         return False
-    known = {*TABLES, *kind_names()}
+    known = {*TABLES, *KINDS.names()}
     return bool(set(tables) - {"calibration"}) and not set(tables) - known  # which calibrations have, too
 
 

@@ -56,7 +56,7 @@ from kinefit.readers.take.entries import (
     sensor_name,
     title_of,
 )
-from kinefit.readers.take.kinds import SensorKind, kind_of
+from kinefit.readers.take.kinds import KINDS, SensorKind
 from kinefit.readers.take.skin import load_skin
 from kinefit.readers.video import Video, common_frames
 
@@ -148,7 +148,7 @@ def _load_sensors(cameras: TakeCameras) -> tuple[TakeSensor, ...]:
     """
     out = list[TakeSensor]()
     for table, entries in cameras.take.sensors.items():
-        kind = kind_of(table)
+        kind = KINDS.get(table)
         for k, entry in enumerate(entries):
             name = sensor_name(kind.label or table, entries, k)
             valid = lambda r, name=name, kind=kind: (

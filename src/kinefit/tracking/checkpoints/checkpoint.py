@@ -23,7 +23,7 @@ from kinefit.errors import ExportError, KinefitError
 from kinefit.frame.results import FrameResult
 from kinefit.motion import Motion
 from kinefit.readers.take.file import Take, read_take
-from kinefit.readers.take.kinds import SensorKind, kinds_of
+from kinefit.readers.take.kinds import SensorKind, plugins_of
 from kinefit.sensors.base import Measurement
 from kinefit.tracking.checkpoints.frame_file import FrameFile
 
@@ -191,8 +191,8 @@ def key_of(take: Take, **options: Any) -> str:
     """Digest of a take, of its files as far as size and time of change tell, of options and of kinefit's own code."""
     digest = hashlib.sha256(repr((take, sorted(options.items()), np.__version__)).encode())
     digest.update(code_digest())
-    for kind in kinds_of(take):
-        digest.update(b"" if kind.plugin is None else kind.plugin.code_digest)
+    for plugin in plugins_of(take):
+        digest.update(plugin.code_digest)
     takes = [take] if take.subject is None else [take, read_take(take.subject)]
     paths = set().union(*(_paths(one) | {Path(one.body)} for one in takes)) - {take.path}
     for path in sorted(paths, key=str):
