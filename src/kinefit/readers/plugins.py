@@ -12,6 +12,7 @@ import os
 import re
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -249,6 +250,9 @@ def _record(of: Extensions[Any], name: str) -> Any:
     return record
 
 
+_KINDS_OF_FILES = ("keypoints.", "markers.", "calibration.")  # with which names of entry points begin
+
+
 @dataclass(frozen=True)
 class FileFormat(Extension):
     """A format of files that are read into keypoints, markers or a rig.
@@ -272,6 +276,14 @@ class FileFormat(Extension):
 
 class FileFormats(Extensions[FileFormat]):
     """The formats of one kind of file."""
+
+    def names(self) -> tuple[str, ...]:
+        """All names, kinefit's own first; warns of plug-ins of no kind of file."""
+        for point, plugins in installed(self.group).items():
+            if not point.startswith(_KINDS_OF_FILES):
+                told = f"{plugins[0]} is ignored: its name begins with none of {', '.join(_KINDS_OF_FILES)}"
+                warnings.warn(told, stacklevel=2)
+        return super().names()
 
     def name_of(self, path: Path, faults: list[KinefitError] | None = None) -> str | None:
         """Name of the format that recognises a file, kinefit's own asked first; None if none does.
@@ -304,13 +316,13 @@ class FileFormats(Extensions[FileFormat]):
 KEYPOINTS = FileFormats("kinefit.readers", FileFormat, "keypoint format", {
     "openpose": "kinefit.readers.keypoints:OPENPOSE", "mediapipe": "kinefit.readers.keypoints:MEDIAPIPE",
     "caliscope": "kinefit.readers.keypoints:CALISCOPE",
-}, "keypoints.")  # fmt: skip
+}, _KINDS_OF_FILES[0])  # fmt: skip
 """Formats of keypoints, which take files name; the most informative confidence first."""
 
 MARKERS = FileFormats("kinefit.readers", FileFormat, "marker format", {
     "c3d": "kinefit.readers.markers:C3D", "trc": "kinefit.readers.markers:TRC",
-}, "markers.")  # fmt: skip
+}, _KINDS_OF_FILES[1])  # fmt: skip
 """Formats of labelled or unlabelled markers."""
 
-CALIBRATIONS = FileFormats("kinefit.readers", FileFormat, "calibration format", {}, "calibration.")
+CALIBRATIONS = FileFormats("kinefit.readers", FileFormat, "calibration format", {}, _KINDS_OF_FILES[2])
 """Formats of calibrations of plug-ins; those of kinefit are recognised together, by `read_calibration`."""
