@@ -332,7 +332,7 @@ def test_a_name_that_is_taken(other, group, point, words, tmp_path):
 
 def test_a_reader_of_no_kind_of_file_is_named(other):
     other("readers", "keypoint.dlc")
-    with pytest.warns(UserWarning, match=r"kinefit-other 0\.2 .*keypoint\.dlc.* ignored.* none of keypoints\., markers"):
+    with pytest.warns(UserWarning, match=r"kinefit-other 0\.2 .*keypoint\.dlc.* ignored.*none of keypoints\., markers"):
         KEYPOINTS.names()
 
 
