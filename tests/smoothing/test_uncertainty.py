@@ -54,7 +54,7 @@ def covariance(scene, noise, Sigma=None, cameras=None):
     known, layout = KeypointPriors.of(subject, channels, cameras), Layout(channels, subject.body)
     known = replace(known, covariance=np.zeros_like(known.covariance) if Sigma is None else Sigma)
     n = subject.body.tree.n_dofs
-    none = np.zeros((n, n)), Pushes.none(n)  # no other sensors
+    none = np.zeros((n, n)), Pushes(np.zeros((0, n)), np.zeros((0, n)), np.zeros((n, n)))  # no other sensors
     return systematic_errors(known, layout, state, weight, noise, SharedErrors.none(len(weight)), *none)
 
 
@@ -84,7 +84,7 @@ def test_a_constant_error_changes_a_difference_of_frames_as_refitting_does(scene
     subject, channels, _, _ = scene
     random = np.random.default_rng(1)
     layout, n = Layout(channels, subject.body), subject.body.tree.n_dofs
-    none = np.zeros((n, n)), Pushes.none(n)
+    none = np.zeros((n, n)), Pushes(np.zeros((0, n)), np.zeros((0, n)), np.zeros((n, n)))
     count = len(channels.column)
     noise = replace(noise_of(channels), bias=np.full(count, 2.0))
     exact = replace(KeypointPriors.of(subject, channels, None), covariance=np.zeros((len(subject.covariance),) * 2))

@@ -22,10 +22,9 @@ from kinefit.frame.trust import segments_not_shown
 from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.points.keypoints import pixels_of
-from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.packed_pixels import PackedPixels
+from kinefit.smoothing.packed import PackedMarkers, PackedPixels
 from kinefit.smoothing.spool import Spool
 from kinefit.solvers.equations import normal_equations
 from kinefit.solvers.trajectory import _kernels_smoothing
@@ -212,13 +211,12 @@ class TrackedFrames:
         found = PackedPixels.of(matches, rig, len(self.results), self.tracker.settings.loss)
         return found.swapped_as(found.swapped, self.tracker.body, roots, angles)
 
-    def packed_markers(self) -> PackedMarkers | None:
+    def packed_markers(self) -> PackedMarkers:
         """Labelled markers of all frames as one block; joints that move with morphs need rows instead."""
-        if self.markers is not None or not len(self.results):
+        if self.markers is not None:
             return self.markers
-        if self.tracker.scene_of(self.results[0].state, 0.0).morphing is not None:
-            return None
-        measured = (r.measurements for r in self.results)
+        morphing = self.tracker.scene_of(self.results[0].state, 0.0).morphing is not None
+        measured = (() if morphing else r.measurements for r in self.results)
         return PackedMarkers.of(self.tracker.body, measured, self.times, self.tracker.settings.marker_loss)
 
 

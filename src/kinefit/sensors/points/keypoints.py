@@ -58,7 +58,7 @@ class Layout:
     @cached_property
     def points(self) -> PointSet:
         """A point of the body for every channel (N,)."""
-        return self._of(self.channels)
+        return self.channels.each
 
     @cached_property
     def groups(self) -> NDArray:
@@ -100,7 +100,7 @@ class Layout:
         if body is self.body:
             return self.points
         if self._latest.get("body") is not body:
-            self._latest.update(body=body, points=self._of(self.channels.with_points(body)))
+            self._latest.update(body=body, points=self.channels.with_points(body).each)
         return self._latest["points"]
 
     @cached_property
@@ -123,14 +123,6 @@ class Layout:
     def names(self) -> tuple[str, ...]:
         """(N,) source and point of every channel."""
         return tuple(f"{self.channels.sources[q]} {name}" for q, name in zip(self.channels.source, self.points.names))
-
-    @staticmethod
-    def _of(channels: Channels) -> PointSet:
-        if not len(channels.column):
-            return channels.points
-        names = tuple(channels.points.names[c] for c in channels.column)
-        owner, place = channels.points.segments, channels.points.points
-        return PointSet(names, owner[channels.column], place[channels.column])
 
 
 def projected(scene: Scene, layout: Layout) -> NDArray:
