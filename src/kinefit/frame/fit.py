@@ -20,7 +20,6 @@ from kinefit.frame.trust import (
     angles_off_prediction,
     dofs_moving,
     dofs_of_joints,
-    moves_keypoints,
     observed,
     reset_to_prior,
     segments_not_shown,
@@ -29,7 +28,6 @@ from kinefit.frame.trust import (
 from kinefit.rows import AnyRows, Rows, weaker
 from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.points.keypoints import KeypointMatched, pixels_of
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.closed import closed_step, on_null_space
@@ -268,15 +266,16 @@ class FrameFit:
     def _observed_dofs(self, scene: Scene, matched: Sequence[Matched], now: NDArray, without: Without) -> NDArray:
         """(n,) bool: degrees of freedom that this frame's measurements observe; `now` is their information with prior.
 
-        A joint that moves keypoints by less than `MIN_LEVER` is observed only if other sensors observe it.
+        A joint that moves points of images by less than `MIN_LEVER` is observed only if other sensors observe it.
         """
         seen = observed(self.body.tree, now)
-        pixels = pixels_of(matched)
-        if not pixels:
+        moved = [m.moves(scene) for m in matched]
+        moving = [of_points for of_points in moved if of_points is not None]
+        if not moving:
             return seen
-        short = seen[6:] & ~moves_keypoints(scene, pixels) & ~looped(self.body)
+        short = seen[6:] & ~np.any(moving, axis=0) & ~looped(self.body)
         if short.any():
-            others = [k for k, m in enumerate(matched) if not isinstance(m, KeypointMatched)]
+            others = [k for k, of_points in enumerate(moved) if of_points is None]
             if others:
                 off = without and [without[k] for k in others]
                 rows = self.rows(scene, None, [matched[k] for k in others], without=off)

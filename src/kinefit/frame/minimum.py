@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import BodyState
 from kinefit.correspondences.closures import closed_at
 from kinefit.rows import AnyRows
-from kinefit.sensors.base import Matched
-from kinefit.sensors.points.keypoints import packed
+from kinefit.sensors.base import Matched, packed
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.closed import Constraint, closed_fit
 from kinefit.solvers.least_squares import levenberg_marquardt

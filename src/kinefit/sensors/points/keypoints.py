@@ -20,7 +20,7 @@ from kinefit.observations import KEYPOINTS, KeypointFrame, Keypoints
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.channels import Channels, known_points, make_channels
-from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence
+from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence, moves_points
 from kinefit.sensors.points.views import (
     HandViews,
     ViewBias,
@@ -333,6 +333,12 @@ class KeypointMatched(Matched):
             return None
         return PixelPoints(layout.points_of(body), layout.channels.camera, self.uv, self.weight, self.loss)
 
+    def moves(self, scene: Scene) -> NDArray:
+        """(D,) bool: coordinates that move a keypoint whose detection agrees with the fit."""
+        inside = (self.weight > 0) & (self.squares(scene.at_time(self.time)) < AGREEMENT_SIGMAS**2)
+        points, state = self.measurement.layout.points_of(scene.body), scene.state
+        return moves_points(scene.body, points, inside[None], state.T_world_root[None], state.angles[None])[0]
+
     def squares(self, scene: Scene) -> NDArray:
         """(N,) squared distances in the image, in variances; 0 where unseen, inf where it could not be seen."""
         gap = self.uv - projected(scene, self.measurement.layout)
@@ -404,12 +410,6 @@ class KeypointMatched(Matched):
 def keypoint_sigma(keypoints: Sequence[Keypoints], sigma: Mapping[str, float], default: float) -> list[float]:
     """[px] of each record, where {camera: standard deviation} or {"CAMERA SET": standard deviation} are given."""
     return [sigma.get(f"{k.camera} {k.keypoint_set}", sigma.get(k.camera, default)) for k in keypoints]
-
-
-def packed(matched: Sequence[Matched], scene: Scene) -> PixelPoints | None:
-    """The points of a scene's only match for a fit in one compiled piece; None where rows are needed."""
-    one = next(iter(pixels_of(matched)), None) if len(matched) == 1 else None
-    return None if one is None or scene.at_time(one.time) is not scene else one.packed(scene)
 
 
 def pixels_of(matched: Iterable[Matched]) -> list[KeypointMatched]:
