@@ -65,18 +65,6 @@ class Fitted:
     released: NDArray | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class _FrameFit:
-    """The end of a fit: the scene, the normal matrix (n, n) and the cost under the fit's own match."""
-
-    scene: Scene
-    H: NDArray
-    cost: float
-    matched: tuple[Matched, ...]
-    iterations: int
-    apart: bool = False
-
-
 class FrameFit:
     """Fits frames of one body.
 
@@ -131,11 +119,11 @@ class FrameFit:
                     best, evidence, released = other, new, free
         return replace(self._assess(best, release_dofs(held, released), evidence, known), released=released)
 
-    def _fit(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _FrameFit:
+    def _fit(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> Minimum:
         settled = all(m.settled for m in measurements)
         return (self._fit_to_minimum if settled else self._fit_step_by_step)(scene, held, measurements)
 
-    def _fit_step_by_step(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _FrameFit:
+    def _fit_step_by_step(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> Minimum:
         """Fit with nearest points (ICP): one step after each match, while the reach shrinks to `near`."""
         s, iterations = self.settings, 0
         reach = float(np.clip(max(m.within for m in measurements if not m.settled), s.near, s.far))
@@ -152,11 +140,11 @@ class FrameFit:
             if gain < s.tolerance**2 * len(step.delta) and reach <= s.near:
                 break
             reach = max(reach * s.shrink, s.near)
-        return _FrameFit(scene, step.equations.matrix, step.equations.cost, tuple(matched), iterations, True)
+        return Minimum(scene, step.equations.matrix, step.equations.cost, iterations, tuple(matched))
 
     def _fit_to_minimum(
         self, scene: Scene, held: Held | None, measurements: Sequence[Measurement], reach: float = 0.0
-    ) -> _FrameFit:
+    ) -> Minimum:
         """Fit without nearest points: minimise under each match, until the match no longer changes.
 
         A `reach` [m] above the setting `near` widens the loss of the first rounds.
@@ -174,7 +162,7 @@ class FrameFit:
             if all(a.key == b.key for a, b in zip(matched, again)):
                 break
             matched = again
-        return _FrameFit(scene, found.H, found.cost, tuple(matched), iterations)
+        return replace(found, iterations=iterations)
 
     def _minimum(
         self, scene: Scene, held: Held | None, matched: Sequence[Matched], most: int, tolerance: float
@@ -217,7 +205,7 @@ class FrameFit:
         margin, sigma = -s.flesh, s.collision
         return [collision_rows(self.body, scene.state, pairs=self._pairs, margin=margin, sigma=sigma)]
 
-    def _assess(self, found: _FrameFit, held: Held | None, each: Sequence[Evidence], known: NDArray | None) -> Fitted:
+    def _assess(self, found: Minimum, held: Held | None, each: Sequence[Evidence], known: NDArray | None) -> Fitted:
         """Covariances and quality of a fit, without rows on contradicted segments and of surfaces that occlude one."""
         scene, tree, evidence = found.scene, self.body.tree, sum_evidence(found.scene, each)
         A = np.zeros((0, tree.n_dofs)) if self._hard is None else self._hard(scene.state)[1]

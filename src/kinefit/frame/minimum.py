@@ -26,12 +26,13 @@ ROUGH_TOLERANCE = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """A minimum: the scene, the normal matrix (n, n), the cost, and the number of steps tried."""
+    """A minimum: the scene, the normal matrix (n, n), the cost, the number of steps tried, and the match."""
 
     scene: Scene
     H: NDArray
     cost: float
     iterations: int
+    matched: tuple[Matched, ...]
 
 
 def minimum(
@@ -52,7 +53,7 @@ def minimum(
     if held is not None and pixels is not None:  # keypoints alone, of a body without morphs: by the compiled solver
         found = fit_pixels(scene.body, scene.state, scene.rig, pixels, held, max_iterations=most, tolerance=tolerance)
         if found is not None:
-            return Minimum(scene.at(found.state), found.H, found.cost, found.iterations)
+            return Minimum(scene.at(found.state), found.H, found.cost, found.iterations, tuple(matched))
 
     def at(state: BodyState) -> list[AnyRows]:
         return rows(scene.at(state))
@@ -68,4 +69,5 @@ def minimum(
             )  # fmt: skip
             start, tried = near.state, near.iterations
         fit = closed_fit(body, start, at, hard, max_iterations=most, tolerance=tolerance, damping=damping)
-    return Minimum(scene.at(fit.state), fit.equations.matrix, fit.equations.cost, fit.iterations + tried)
+    eq, tried = fit.equations, fit.iterations + tried
+    return Minimum(scene.at(fit.state), eq.matrix, eq.cost, tried, tuple(matched))

@@ -113,8 +113,9 @@ def _results(
         if others is None and not len(take.pixels.points):
             part = markers.part(some)
             at = take.roots[some], take.angles[some]
+            states = [BodyState(root, q) for root, q in zip(*at)]
             made = frame_results(
-                body, *at, frames.times[some], covariance, part.evidence(body, part.gaps(body, *at)),
+                body, states, frames.times[some], covariance, part.evidence(body, part.gaps(body, *at)),
                 observed=take.observed[some], iterations=[r.iterations for r in tracked],
             )  # fmt: skip
         else:

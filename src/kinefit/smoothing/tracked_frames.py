@@ -81,6 +81,14 @@ class Linearised:
     rows: NDArray
     unsupported: NDArray | None = None
 
+    def equations(self, roots: NDArray, angles: NDArray) -> Equations:
+        """Equations at other states (T, 4, 4), (T, D), dense."""
+        delta = np.empty(self.g.shape)
+        _kernels_smoothing.differences(self.roots, roots, self.angles, angles, delta)
+        moved = np.einsum("tij,tj->ti", self.H, delta)
+        cost = self.cost - 2.0 * np.einsum("ti,ti->t", self.g, delta) + np.einsum("ti,ti->t", moved, delta)
+        return np.array(self.H), self.g - moved, cost
+
     def part(self, frames: slice) -> Linearised:
         """The costs of some frames."""
         names = ("H", "g", "cost", "roots", "angles", "matched", "rows")
@@ -226,14 +234,9 @@ def with_quadratic(body: Body, make: MakeEquations, more: Linearised) -> MakeEqu
 
     def both(roots: NDArray, angles: NDArray) -> Equations:
         packed, g, cost = make(roots, angles)
-        delta = np.empty(more.g.shape)
-        _kernels_smoothing.differences(more.roots, roots, more.angles, angles, delta)
-        moved = np.einsum("tij,tj->ti", more.H, delta)
-        C = np.array(more.H)
+        C, more_g, more_cost = more.equations(roots, angles)
         _kernels_smoothing.add_packed(packed, chain, depth, C)
-        g += more.g - moved
-        cost += more.cost - 2.0 * np.einsum("ti,ti->t", more.g, delta) + np.einsum("ti,ti->t", moved, delta)
-        return C, g, cost
+        return C, g + more_g, cost + more_cost
 
     return both
 

@@ -234,7 +234,7 @@ class MatchedFrames:
         world = self._worlds.at(theta)
         return [
             [
-                FrameRows(matched, self._rows((f, i), matched.sensor, matched, self._scene(world, f, state), world))
+                (matched, self._rows((f, i), matched.sensor, matched, self._scene(world, f, state), world))
                 for i, matched in enumerate(self._matched[f])
             ]
             for f, state in enumerate(states)

@@ -108,11 +108,11 @@ def _judged(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray)
     out = Spool[FrameResult]()
     for some in stretches(len(roots), MATRIX_FRAMES):
         part, at = markers.part(some), (roots[some], angles[some])
-        states = (BodyState(root, q) for root, q in zip(*at))
+        states = [BodyState(root, q) for root, q in zip(*at)]
         covariances = np.stack([covariance_alone(body, *s) for s in zip(states, part.information(body, *at))])
         observed = np.sqrt(np.einsum("fii->fi", covariances))[:, 6:] <= UNOBSERVED_STD_RATIO * body.tree.spread
         for result in frame_results(
-            body, *at, part.times, covariances, part.evidence(body, part.gaps(body, *at)), observed=observed,
+            body, states, part.times, covariances, part.evidence(body, part.gaps(body, *at)), observed=observed,
             iterations=[0] * len(covariances),
         ):
             out.append(result)

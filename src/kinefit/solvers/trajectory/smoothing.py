@@ -80,13 +80,11 @@ class Posterior:
     frames : (T, n, n) covariance of every frame
     following : (T - 1, n, n) cross-covariance of frame t + 1 (rows) and frame t (columns)
     change_variance : (T - 1, n) of every r_s
-    log_determinant : float, of the system's matrix
     """
 
     frames: NDArray
     following: NDArray
     change_variance: NDArray
-    log_determinant: float
 
 
 def smooth(
@@ -271,7 +269,7 @@ def posterior(body: Body, smoothed: Smoothed, since: int = 0, share: NDArray | N
     past, _ = prior.rows(max(T - 1, 0))
     variance = np.zeros((max(T - 1, 0), n))
     _kernels_band.covariance_blocks(W, below, past, since, frames, following, variance)
-    return Posterior(frames, following, variance, -2.0 * float(np.log(np.einsum("tii->ti", W)[:, :n]).sum()))
+    return Posterior(frames, following, variance)
 
 
 def _add_posture(C: NDArray, weight: NDArray, depth: NDArray) -> None:
