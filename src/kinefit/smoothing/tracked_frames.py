@@ -26,7 +26,7 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.packed import PackedMarkers, PackedPixels
 from kinefit.smoothing.spool import Spool
-from kinefit.solvers.equations import normal_equations
+from kinefit.solvers.equations import normal_equations, robust_factors
 from kinefit.solvers.trajectory import _kernels_smoothing
 from kinefit.solvers.trajectory.smoothing import Equations, MakeEquations
 
@@ -245,9 +245,4 @@ def squares_of(rows: AnyRows) -> tuple[NDArray, NDArray]:
     """Squared residuals (R,) of rows, in variances, and robust factors (R,); both empty for other kinds of rows."""
     if not isinstance(rows, Rows | DofRows):
         return np.zeros(0), np.zeros(0)
-    square = rows.weight * rows.residual**2
-    if rows.loss is None:
-        return square, np.ones(len(square))
-    data = np.zeros((8, len(square)))
-    data[6], data[7] = rows.residual, rows.weight
-    return square, rows.loss.of_rows(data, rows.group)[0]
+    return rows.weight * rows.residual**2, robust_factors(rows)[0]
