@@ -182,9 +182,15 @@ def noise_of_sensors(
     frames : (K,) int, increasing, in which systematic errors are asked for; default: all
     """
     body, T, n = take.body, len(take.roots), take.body.tree.n_dofs
-    information, rest = room((T, n * (n + 1) // 2)), room((T, n * (n + 1) // 2))
-    errors = _of_markers(take, information, rest)
+    shape, upper, errors = (T, n * (n + 1) // 2), np.triu_indices(n), dict[str, _SensorErrors]()
+    information = rest = np.broadcast_to(0.0, shape)
+    if take.markers.sensors:
+        information = room(shape)
+        errors |= _of_markers(take, information)
+        # Neighbouring frames repeat the same error of the prior, which counts where the cost is flat.
+        rest = np.broadcast_to(block_diagonal(np.zeros((6, 6)), body.tree.posture_precision)[upper], shape)
     if take.others is not None and matched is not None:
+        information, rest = (np.add(values, 0.0, out=room(shape)) for values in (information, rest))
         errors |= _of_rows(take, take.others, matched, information, rest, surfaces=surfaces)
     absorbed = defaultdict[str, list[NDArray]](list)
     for f in np.linspace(0, T - 1, min(_LEVERAGE_FRAMES, T)).astype(int) if errors else ():
@@ -251,19 +257,15 @@ def _of_rows(
     }  # fmt: skip
 
 
-def _of_markers(take: SmoothTake, information: NDArray, rest: NDArray) -> dict[str, _SensorErrors]:
-    """Errors of packed markers by sensor; adds to `information` and `rest`, see `OtherNoise`."""
+def _of_markers(take: SmoothTake, information: NDArray) -> dict[str, _SensorErrors]:
+    """Errors of packed markers by sensor; fills in `information`, see `OtherNoise`."""
     body, markers, n = take.body, take.markers, take.body.tree.n_dofs
-    if not len(markers.points):
-        return {}
     upper, gaps, weight = np.triu_indices(n), room(markers.values.shape), room(markers.stated.shape)
     for some in stretches(len(gaps), MATRIX_FRAMES):
         part, at = markers.part(some), (take.roots[some], take.angles[some])
-        information[some] += part.information(body, *at)[:, upper[0], upper[1]]
+        information[some] = part.information(body, *at)[:, upper[0], upper[1]]
     for some, part, of_part in markers.stretched(body, take.roots, take.angles):
         gaps[some], weight[some] = of_part, part.factors(of_part) * part.weight
-    # Neighbouring frames repeat the same error of the prior, which counts where the cost is flat.
-    rest += block_diagonal(np.zeros((6, 6)), body.tree.posture_precision)[upper]
 
     def pushes(f: int, own: NDArray) -> list[_Push]:
         seen = np.flatnonzero(weight[f, own] > 0.0)
