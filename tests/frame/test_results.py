@@ -29,8 +29,13 @@ def observed_but(*names):
     return observed
 
 
+def deviations_of(C, observed):
+    dofs, joints = deviations(BODY, joint_moves(BODY, STATE)[None], C[None], observed[None])
+    return dofs[0], joints[0]
+
+
 def joint_std(segment, *unobserved, segments=(*SEEN, *ELBOWS)):
-    _, joints = deviations(BODY, STATE, posterior(segments), observed_but(*unobserved))
+    _, joints = deviations_of(posterior(segments), observed_but(*unobserved))
     return joints[TREE.segment(segment)]
 
 
@@ -39,7 +44,7 @@ def joint_std(segment, *unobserved, segments=(*SEEN, *ELBOWS)):
 def test_joints_that_are_measured_are_known_though_one_coordinate_above_them_is_not(segment, unobserved):
     """Only the sum of the spine's angles is measured: each alone is unknown, by 5 cm at the elbow."""
     C = posterior((*SEEN, *ELBOWS))
-    dofs, _ = deviations(BODY, STATE, C, observed_but(unobserved))
+    dofs, _ = deviations_of(C, observed_but(unobserved))
     assert np.isinf(dofs[6 + TREE.coordinate(unobserved)])
     moves = joint_moves(BODY, STATE)[TREE.segment(segment)]
     fitted = np.sqrt(np.diag(moves @ C @ moves.T))
@@ -65,8 +70,8 @@ def test_variances_of_unobserved_coordinates_are_those_of_the_prior():
     turn = TREE.coordinate("pro_sup_r")
     C[6 + turn] = C[:, 6 + turn] = 0.0
     C[6 + turn, 6 + turn] = 0.01
-    with_prior = deviations(BODY, STATE, C, observed_but("pro_sup_r"))
-    before = deviations(BODY, STATE, C)
+    with_prior = deviations_of(C, observed_but("pro_sup_r"))
+    before = deviations_of(C, observed_but())
     assert np.isinf(with_prior[0][6 + turn]) and np.isfinite(before[0][6 + turn])
     known = [TREE.segment(s) for s in (*SEEN, *ELBOWS)]
     np.testing.assert_allclose(with_prior[1][known], before[1][known])

@@ -17,6 +17,7 @@ from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import squat_and_wave
 from kinefit.smoothing import sensor_noise
+from kinefit.smoothing.packed import PackedMarkers
 from kinefit.smoothing.smoother import as_tracked
 from kinefit.smoothing.tracked_frames import squares_of
 from kinefit.solvers.equations import block_diagonal, design, normal_equations
@@ -38,7 +39,8 @@ def tracked():
     take = as_tracked(frames)
     assert take.others is None
     rows = replace(frames, scale={"mocap": 1.0}, points=np.zeros(len(truth)))
-    by_rows = replace(take, markers=None, others=rows)
+    nothing = PackedMarkers.of(truth.body, (), frames.times, take.markers.loss)
+    by_rows = replace(take, markers=nothing, others=rows)
     matched = [rows.matched(rows.scene(f, take.roots, take.angles)) for f in range(len(truth))]
     return truth.body, take, by_rows, matched
 
@@ -47,8 +49,7 @@ def tracked():
 def test_information_and_lasting_errors_are_sums_over_rows_and_frames(tracked, packed):
     body, block, take, matched = tracked
     n, T = body.tree.n_dofs, len(take.roots)
-    none = np.zeros((n, n))
-    found = sensor_noise.noise_of_sensors(block if packed else take, matched, lambda f: none, half=HALF)
+    found = sensor_noise.noise_of_sensors(block if packed else take, matched, half=HALF)
     pushes, stated, channels, followed = [], {}, {}, {}
     for f, several in enumerate(matched):
         scene, information = take.others.scene(f, take.roots, take.angles), np.zeros((n, n))
@@ -66,7 +67,8 @@ def test_information_and_lasting_errors_are_sums_over_rows_and_frames(tracked, p
                 pushes[-1][channel, i % 3] = w[i] * J[i]
                 stated.setdefault((channel, i % 3), []).append(m.lasts / rows.weight[i])
                 followed.setdefault(channel, []).append(left[i])
-        assert np.allclose(found.pooled(f, 0), information, rtol=1e-9, atol=1e-9 * information.max())
+        of_frame = sensor_noise.square(found.information[f])
+        assert np.allclose(of_frame, information, rtol=1e-9, atol=1e-9 * information.max())
     (components,) = found.components.values()
     unseen = 5.0 / (5.0 + 3.0 * sum(1.0 - np.mean(values) for values in followed.values()))  # of what is stated
     assert 0.03 < unseen < 0.3
@@ -111,10 +113,9 @@ def test_surfaces_move_the_pose_as_refitting_does(tracked, points):
     T, n, settings = len(take.roots), body.tree.n_dofs, TrackSettings()
     others = replace(take.others, points=np.full(T, points), scale={})
     matched = [(Surface(body, others.scene(f, take.roots, take.angles).state, f),) for f in range(T)]
-    none = np.zeros((n, n))
-    found = sensor_noise.other_noise(body, others, matched, take.roots, take.angles, lambda f: none, half=0)
+    found = sensor_noise.noise_of_sensors(replace(take, others=others), matched, half=0)
     scene, (surface,) = others.scene(5, take.roots, take.angles), matched[5]
-    information, lasting = found.pooled(5, 0), found.pushes(5).rest
+    information, lasting = found.pooled(5), found.pushes(5).rest
     alone = sensor_noise.covariance_alone(body, scene.state, information)
 
     def equations(error):

@@ -54,9 +54,12 @@ def covariance(scene, noise, Sigma=None, cameras=None):
     known, layout = KeypointPriors.of(subject, channels, cameras), Layout(channels, subject.body)
     known = replace(known, covariance=np.zeros_like(known.covariance) if Sigma is None else Sigma)
     n = subject.body.tree.n_dofs
-    none = np.zeros((n, n)), Pushes.none(n)  # no other sensors
-    assumed = np.full(len(weight), SIGMA**2)
+    assumed, none = np.full(len(weight), SIGMA**2), no_others(n)
     return systematic_errors(known, layout, state, weight, assumed, noise, SharedErrors.none(len(weight)), *none)
+
+
+def no_others(n):
+    return np.zeros((n, n)), Pushes(*np.zeros((2, 0, n)), *np.zeros((2, n, n)))
 
 
 def noise_of(channels, drift=0.0, shift=None):
@@ -85,7 +88,7 @@ def test_a_constant_error_changes_a_difference_of_frames_as_refitting_does(scene
     subject, channels, _, _ = scene
     random = np.random.default_rng(1)
     layout, n = Layout(channels, subject.body), subject.body.tree.n_dofs
-    none = np.zeros((n, n)), Pushes.none(n)
+    none = no_others(n)
     count = len(channels.column)
     noise = replace(noise_of(channels), bias=np.full(count, 2.0))
     exact = replace(KeypointPriors.of(subject, channels, None), covariance=np.zeros((len(subject.covariance),) * 2))
@@ -116,7 +119,7 @@ def test_white_errors_smaller_than_assumed_move_the_pose_less_as_refitting_does(
     moved = np.array([state.difference(fit(subject.body, channels, exact + e, weight, state)) for e in errors])
     noise = replace(noise_of(channels), jitter=np.full(len(weight), sigma))
     layout, n = Layout(channels, subject.body), subject.body.tree.n_dofs
-    none = np.zeros((n, n)), Pushes.none(n)
+    none = no_others(n)
     known = KeypointPriors.of(subject, channels, None)
     assumed = 1.0 / np.where(weight > 0, weight, np.inf)
     one, alone = (

@@ -17,7 +17,7 @@ from kinefit.rows import ParameterRows, Rows
 from kinefit.sensors.base import RowsOf, Unknown
 from kinefit.sensors.points.markers import MarkerMeasurement, MarkerSensor
 from kinefit.solvers.bundle.border_frames import differences
-from kinefit.subject.gear import FrameRows, excess
+from kinefit.subject.gear import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import (
     KNOWN_SIZE_STD,
@@ -180,7 +180,7 @@ def seen(sensor, parts, surface=False, channels=None):
     matched = RowsOf(None, channels=channels)
     object.__setattr__(matched, "sensor", sensor)
     object.__setattr__(matched, "of_points", not surface)
-    return FrameRows(matched, parts)
+    return matched, parts
 
 
 def test_errors_that_last_are_told_from_fresh_ones():
@@ -202,7 +202,7 @@ def test_markers_that_come_and_go_are_known_by_their_names():
         frames.append([seen("mocap", [rows(bias[on])], channels=names[on].tolist())])
     assert excess(frames, 0.0)["mocap"] == pytest.approx(10.0, rel=0.4)
     with pytest.raises(ObservationError, match="'mocap' have no names.*RowsOf"):
-        excess([[seen("mocap", one[0].rows)] for one in frames], 0.0)
+        excess([[seen("mocap", one[0][1])] for one in frames], 0.0)
 
 
 def test_errors_of_a_surface_last_over_a_segment():
@@ -213,7 +213,7 @@ def test_errors_of_a_surface_last_over_a_segment():
               for _ in range(10)]  # fmt: skip
     assert excess(frames, 0.0)["depth"] > 30.0
     names = [str(g) for g in range(100000)]
-    points = [[seen("depth", one[0].rows, channels=names)] for one in frames]
+    points = [[seen("depth", one[0][1], channels=names)] for one in frames]
     assert excess(points, 0.0)["depth"] < 2.0
 
 

@@ -20,7 +20,6 @@ from kinefit.frame.trust import (
     angles_off_prediction,
     dofs_moving,
     dofs_of_joints,
-    moves_keypoints,
     observed,
     reset_to_prior,
     segments_not_shown,
@@ -29,7 +28,6 @@ from kinefit.frame.trust import (
 from kinefit.rows import AnyRows, Rows, weaker
 from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.points.keypoints import KeypointMatched, pixels_of
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.closed import closed_step, on_null_space
@@ -65,18 +63,6 @@ class Fitted:
     seen: NDArray
     known: NDArray
     released: NDArray | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class _FrameFit:
-    """The end of a fit: the scene, the normal matrix (n, n) and the cost under the fit's own match."""
-
-    scene: Scene
-    H: NDArray
-    cost: float
-    matched: tuple[Matched, ...]
-    iterations: int
-    apart: bool = False
 
 
 class FrameFit:
@@ -133,11 +119,11 @@ class FrameFit:
                     best, evidence, released = other, new, free
         return replace(self._assess(best, release_dofs(held, released), evidence, known), released=released)
 
-    def _fit(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _FrameFit:
+    def _fit(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> Minimum:
         settled = all(m.settled for m in measurements)
         return (self._fit_to_minimum if settled else self._fit_step_by_step)(scene, held, measurements)
 
-    def _fit_step_by_step(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _FrameFit:
+    def _fit_step_by_step(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> Minimum:
         """Fit with nearest points (ICP): one step after each match, while the reach shrinks to `near`."""
         s, iterations = self.settings, 0
         reach = float(np.clip(max(m.within for m in measurements if not m.settled), s.near, s.far))
@@ -154,11 +140,11 @@ class FrameFit:
             if gain < s.tolerance**2 * len(step.delta) and reach <= s.near:
                 break
             reach = max(reach * s.shrink, s.near)
-        return _FrameFit(scene, step.equations.matrix, step.equations.cost, tuple(matched), iterations, True)
+        return Minimum(scene, step.equations.matrix, step.equations.cost, iterations, tuple(matched))
 
     def _fit_to_minimum(
         self, scene: Scene, held: Held | None, measurements: Sequence[Measurement], reach: float = 0.0
-    ) -> _FrameFit:
+    ) -> Minimum:
         """Fit without nearest points: minimise under each match, until the match no longer changes.
 
         A `reach` [m] above the setting `near` widens the loss of the first rounds.
@@ -176,7 +162,7 @@ class FrameFit:
             if all(a.key == b.key for a, b in zip(matched, again)):
                 break
             matched = again
-        return _FrameFit(scene, found.H, found.cost, tuple(matched), iterations)
+        return replace(found, iterations=iterations)
 
     def _minimum(
         self, scene: Scene, held: Held | None, matched: Sequence[Matched], most: int, tolerance: float
@@ -219,7 +205,7 @@ class FrameFit:
         margin, sigma = -s.flesh, s.collision
         return [collision_rows(self.body, scene.state, pairs=self._pairs, margin=margin, sigma=sigma)]
 
-    def _assess(self, found: _FrameFit, held: Held | None, each: Sequence[Evidence], known: NDArray | None) -> Fitted:
+    def _assess(self, found: Minimum, held: Held | None, each: Sequence[Evidence], known: NDArray | None) -> Fitted:
         """Covariances and quality of a fit, without rows on contradicted segments and of surfaces that occlude one."""
         scene, tree, evidence = found.scene, self.body.tree, sum_evidence(found.scene, each)
         A = np.zeros((0, tree.n_dofs)) if self._hard is None else self._hard(scene.state)[1]
@@ -268,15 +254,16 @@ class FrameFit:
     def _observed_dofs(self, scene: Scene, matched: Sequence[Matched], now: NDArray, without: Without) -> NDArray:
         """(n,) bool: degrees of freedom that this frame's measurements observe; `now` is their information with prior.
 
-        A joint that moves keypoints by less than `MIN_LEVER` is observed only if other sensors observe it.
+        A joint that moves points of images by less than `MIN_LEVER` is observed only if other sensors observe it.
         """
         seen = observed(self.body.tree, now)
-        pixels = pixels_of(matched)
-        if not pixels:
+        moved = [m.moves(scene) for m in matched]
+        moving = [of_points for of_points in moved if of_points is not None]
+        if not moving:
             return seen
-        short = seen[6:] & ~moves_keypoints(scene, pixels) & ~looped(self.body)
+        short = seen[6:] & ~np.any(moving, axis=0) & ~looped(self.body)
         if short.any():
-            others = [k for k, m in enumerate(matched) if not isinstance(m, KeypointMatched)]
+            others = [k for k, of_points in enumerate(moved) if of_points is None]
             if others:
                 off = without and [without[k] for k in others]
                 rows = self.rows(scene, None, [matched[k] for k in others], without=off)

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import BodyState
 from kinefit.correspondences.closures import closed_at
 from kinefit.rows import AnyRows
-from kinefit.sensors.base import Matched
-from kinefit.sensors.points.keypoints import packed
+from kinefit.sensors.base import Matched, packed
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.closed import Constraint, closed_fit
 from kinefit.solvers.least_squares import levenberg_marquardt
@@ -27,12 +26,13 @@ ROUGH_TOLERANCE = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """A minimum: the scene, the normal matrix (n, n), the cost, and the number of steps tried."""
+    """A minimum: the scene, the normal matrix (n, n), the cost, the number of steps tried, and the match."""
 
     scene: Scene
     H: NDArray
     cost: float
     iterations: int
+    matched: tuple[Matched, ...]
 
 
 def minimum(
@@ -53,7 +53,7 @@ def minimum(
     if held is not None and pixels is not None:  # keypoints alone, of a body without morphs: by the compiled solver
         found = fit_pixels(scene.body, scene.state, scene.rig, pixels, held, max_iterations=most, tolerance=tolerance)
         if found is not None:
-            return Minimum(scene.at(found.state), found.H, found.cost, found.iterations)
+            return Minimum(scene.at(found.state), found.H, found.cost, found.iterations, tuple(matched))
 
     def at(state: BodyState) -> list[AnyRows]:
         return rows(scene.at(state))
@@ -69,4 +69,5 @@ def minimum(
             )  # fmt: skip
             start, tried = near.state, near.iterations
         fit = closed_fit(body, start, at, hard, max_iterations=most, tolerance=tolerance, damping=damping)
-    return Minimum(scene.at(fit.state), fit.equations.matrix, fit.equations.cost, fit.iterations + tried)
+    eq, tried = fit.equations, fit.iterations + tried
+    return Minimum(scene.at(fit.state), eq.matrix, eq.cost, tried, tuple(matched))

@@ -91,22 +91,6 @@ class FrameResult:
 
 
 def deviations(
-    body: Body, state: BodyState, covariance: NDArray, observed: NDArray | None = None
-) -> tuple[NDArray, NDArray]:
-    """Standard deviations of one frame's degrees of freedom (n,) [m, rad] and joint centres (S, 3) [m].
-
-    Parameters
-    ----------
-    covariance : (n, n) posterior, the prior included once
-    observed : (D,) bool, see `deviations_of_frames`; default: all
-    """
-    observed = np.ones(len(state.angles), bool) if observed is None else observed
-    moves = joint_moves(body, state)
-    std, joints = deviations_of_frames(body, moves[None], np.asarray(covariance)[None], observed[None])
-    return std[0], joints[0]
-
-
-def deviations_of_frames(
     body: Body, moves: NDArray, covariances: NDArray, observed: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Standard deviations of the degrees of freedom (F, n) [m, rad] and of the joint centres (F, S, 3) [m].
@@ -202,32 +186,32 @@ def frame_result(
     evidence : sum over all matches at the fitted state; default: computed here
     """
     evidence = sum_evidence(scene, evidence_of(scene, matched)) if evidence is None else evidence
-    total = float(evidence.agreeing.sum() + evidence.contrary.sum())
-    support = float(evidence.agreeing.sum()) / total if total > 0.0 else 0.0
-    std = deviations(scene.body, scene.state, covariance, observed)
-    return FrameResult(
-        scene.time, scene.state, *std, evidence.segment_quality(scene.body.tree), evidence.lost, evidence.hidden,
-        support, iterations, tuple(matched), scene.measurements,
+    of_one = replace(evidence, **{name: known[None] for name, known in vars(evidence).items() if known is not None})
+    observed = np.ones(len(scene.state.angles), bool) if observed is None else observed
+    (result,) = frame_results(
+        scene.body, [scene.state], [scene.time], np.asarray(covariance)[None], of_one, observed=observed[None],
+        iterations=[iterations],
     )  # fmt: skip
+    return replace(result, matched=tuple(matched), measurements=scene.measurements)
 
 
 def frame_results(
-    body: Body, roots: NDArray, angles: NDArray, times: NDArray, covariances: NDArray, evidence: Evidence, *,
-    observed: NDArray, iterations: Sequence[int],
+    body: Body, states: Sequence[BodyState], times: Sequence[float] | NDArray, covariances: NDArray,
+    evidence: Evidence, *, observed: NDArray, iterations: Sequence[int],
 ) -> list[FrameResult]:  # fmt: skip
     """Several fitted frames at once, without their matches; see `frame_result`.
 
     Parameters
     ----------
-    roots, angles, times : (F, 4, 4) [m], (F, D) [rad], (F,) [s]
+    states : F states
+    times : (F,) [s]
     covariances : (F, n, n) posterior, the prior included once
     evidence : of F frames
     observed : (F, D) bool
     iterations : F numbers
     """
-    states = [BodyState(root, q) for root, q in zip(roots, angles)]
     moves = np.stack([joint_moves(body, state) for state in states])
-    std, joints = deviations_of_frames(body, moves, covariances, observed)
+    std, joints = deviations(body, moves, covariances, observed)
     agreeing, contrary = evidence.agreeing.sum(axis=1), evidence.contrary.sum(axis=1)
     support = agreeing / np.maximum(agreeing + contrary, 1e-12)
     quality, lost, hidden = evidence.segment_quality(body.tree), evidence.lost, evidence.hidden

@@ -24,6 +24,7 @@ from kinefit.rows import DofRows, Rows
 from kinefit.sensors.base import Matched
 from kinefit.sensors.scene import Scene
 from kinefit.solvers import _kernels
+from kinefit.solvers.equations import robust_factors
 
 _MIN_EIGENVALUE_RATIO = 1e-9  # to the segment's largest: a direction below it is not observed
 
@@ -104,7 +105,7 @@ def skin_of(
     R = scene.frames[:, :9].reshape(S, 3, 3)
     middle = np.einsum("sij,sj->si", R, _middles(body)) + scene.frames[:, 9:]
     rows = Rows.concat(*parts)
-    factor = np.concatenate([_factor(p) for p in parts]) if parts else np.zeros(0)
+    factor = np.concatenate([np.zeros(0), *(robust_factors(p)[0] for p in parts)])
     data = np.array(rows.data)
     data[:3] -= middle[rows.segment].T
     blocks = np.zeros((S, 27))
@@ -127,10 +128,6 @@ def skin_of(
         if by @ by > turned[s] @ turned[s]:
             turned[s, 3:] = R[s] @ by
     return Skin(0.5 * (reduced + reduced.swapaxes(1, 2)), g[..., 0], _jacobians(scene, middle), sigma, H, turned)
-
-
-def _factor(rows: Rows) -> NDArray:
-    return np.ones(len(rows)) if rows.loss is None else rows.loss.of_rows(rows.data, rows.group)[0]
 
 
 def _jacobians(scene: Scene, middle: NDArray) -> NDArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +12,7 @@ from kinefit.bodies.tree import KinematicTree
 from kinefit.frame.results import ROOT_PRIOR_STD, UNOBSERVED_STD_RATIO
 from kinefit.rows import AnyRows, PairRows, ParameterRows, Rows
 from kinefit.sensors.base import Matched
-from kinefit.sensors.evidence import AGREEMENT_SIGMAS, Evidence, moves_points, near
-from kinefit.sensors.points.keypoints import KeypointMatched
-from kinefit.sensors.scene import Scene
+from kinefit.sensors.evidence import Evidence, near
 from kinefit.solvers.equations import variances
 
 _MAX_START_SIGMAS = 4.0  # of the prediction: a start farther off discards the prediction
@@ -30,16 +27,6 @@ def observed(tree: KinematicTree, information: NDArray) -> NDArray:
     prior, alone = np.concatenate([np.full(6, ROOT_PRIOR_STD), tree.spread]), np.array(information)
     alone[6:, 6:] -= tree.couplings.T @ tree.couplings
     return np.asarray(np.sqrt(np.maximum(variances(alone), 0.0)) <= UNOBSERVED_STD_RATIO * prior)
-
-
-def moves_keypoints(scene: Scene, pixels: Iterable[KeypointMatched]) -> NDArray:
-    """(D,) bool: coordinates that move a keypoint whose detection agrees with the fit."""
-    out, state = np.zeros(len(scene.body.tree.coordinates), bool), scene.state
-    for m in pixels:
-        inside = (m.weight > 0) & (m.squares(scene.at_time(m.time)) < AGREEMENT_SIGMAS**2)
-        points = m.measurement.layout.points_of(scene.body)
-        out |= moves_points(scene.body, points, inside[None], state.T_world_root[None], state.angles[None])[0]
-    return out
 
 
 def dofs_moving(tree: KinematicTree, segments: NDArray) -> NDArray:

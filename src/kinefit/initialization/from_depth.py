@@ -228,7 +228,7 @@ def _views(
             is_empty = False
         if is_empty:
             raise TrackingError(
-                "nothing in the depth image has the size of a person", remedy=_scale_remedy(depth[depth > 0], body)
+                "nothing in the depth image has the size of a person", remedy=_scale_remedy(depth[depth > 0])
             )
         return
     cloud = np.asarray(points, float).reshape(-1, 3)
@@ -278,7 +278,7 @@ def _resized(coarse: NDArray, shape: tuple[int, ...]) -> NDArray:
     return coarse[np.ix_(rows, columns)]
 
 
-def _scale_remedy(values: NDArray, body: Body) -> str:
+def _scale_remedy(values: NDArray) -> str:
     if not len(values):
         return "The image holds no measurement: check the range gate and the unit."
     middle = float(np.median(values))

@@ -30,6 +30,7 @@ from kinefit.sensors import _kernels
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.scene import Scene, Unknown
 from kinefit.sensors.surfaces.depth_view import DepthSeen, DepthView
+from kinefit.solvers.pixels import PixelPoints
 
 
 def of_kind(value: object, kind: type, what: str, remedy: str, *, each: type | None = None) -> None:
@@ -181,6 +182,14 @@ class Matched(ABC):
         Where `of_points` is False, segments are the channels.
         """
         return None if self.places is None else [f"{of} {name}" if of else name for of, name in self.places]
+
+    def moves(self, scene: Scene) -> NDArray | None:
+        """(D,) bool: coordinates that move what it shows by more than sensors err; None if its rows alone tell."""
+        return None
+
+    def packed(self, scene: Scene) -> PixelPoints | None:
+        """Its points, if it is pixels alone: such a frame is fitted by one compiled kernel."""
+        return None
 
     @abstractmethod
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
@@ -368,6 +377,11 @@ def felt(matched: Matched, scene: Scene, *, check: bool = False) -> Sequence[Any
             added = [v + np.square(b.residual - a.residual) for v, a, b in zip(added, rows, moved, strict=True)]
         object.__setattr__(matched, "added", added)
     return [less_sure(part, v) for part, v in zip(rows, matched.added or (), strict=True)]
+
+
+def packed(matched: Sequence[Matched], scene: Scene) -> PixelPoints | None:
+    """The points of a scene's only match for a fit in one compiled kernel; None where rows are needed."""
+    return matched[0].packed(scene) if len(matched) == 1 and scene.at_time(matched[0].time) is scene else None
 
 
 def leftovers_at(matched: Matched, scene: Scene) -> list[Leftover]:

@@ -61,6 +61,12 @@ class Channels:
         seen = np.isfinite(self.uv).all(axis=-1)
         return np.where(seen, self.confidence / np.square(self.sigma), 0.0)
 
+    @property
+    def each(self) -> PointSet:
+        """The body's point of each channel (N,)."""
+        names = tuple(self.points.names[c] for c in self.column)
+        return PointSet(names, self.points.segments[self.column], self.points.points[self.column])
+
     def part(self, frames: Sequence[int]) -> Channels:
         """The same channels in some frames."""
         if len(frames) == len(self.uv) and np.array_equal(frames, np.arange(len(self.uv))):
@@ -80,8 +86,6 @@ class Channels:
     def with_points(self, body: Body) -> Channels:
         """The same measurements of another body's points."""
         parts = [known_points(body, name).select(self.points.names[span]) for name, span in self.sets.items()]
-        if not parts:
-            return self
         return replace(self, points=joined(parts))
 
 
@@ -94,8 +98,8 @@ def joined(parts: Sequence[PointSet]) -> PointSet:
     """Several point sets as one."""
     return PointSet(
         tuple(n for p in parts for n in p.names),
-        np.concatenate([p.segments for p in parts]),
-        np.concatenate([p.points for p in parts]),
+        np.concatenate([np.zeros(0, np.int64), *(p.segments for p in parts)]),
+        np.concatenate([np.zeros((0, 3)), *(p.points for p in parts)]),
     )
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.sensors.base import Matched
-from kinefit.smoothing.process_noise import DETECTOR_CORRELATION_TIME, SmoothTake, Strength
+from kinefit.smoothing.process_noise import DETECTOR_CORRELATION_TIME, SmoothTake
 from kinefit.smoothing.shape_errors import FrameMatches
 from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.windows import linear_parts, parts
@@ -69,13 +69,12 @@ class Border:
 
 
 def with_border(
-    take: SmoothTake, strength: Strength, border: Border, window: int, overlap: int
+    take: SmoothTake, border: Border, window: int, overlap: int
 ) -> tuple[SmoothTake, Border]:
     """A take at the minimum over its poses and unknowns, and these; of sensors whose rows are points.
 
     Parameters
     ----------
-    strength : process noise and noise of the sensors
     border : to start from
     window, overlap : numbers of frames
     """
@@ -83,7 +82,7 @@ def with_border(
     assert others is not None
     for _ in range(_ROUNDS):
         take = replace(take, others=replace(others, values=border.values))
-        take, S, b = _reduced(take, strength, border, window, overlap)
+        take, S, b = _reduced(take, border, window, overlap)
         informed = np.flatnonzero(np.diag(S) > 0.0)  # of surfaces and of what no row moves, the subject fit knows more
         if not len(informed):
             return take, border
@@ -101,16 +100,16 @@ def with_border(
 
 
 def _reduced(
-    take: SmoothTake, strength: Strength, border: Border, window: int, overlap: int
+    take: SmoothTake, border: Border, window: int, overlap: int
 ) -> tuple[SmoothTake, NDArray, NDArray]:
     """The take smoothed at its values, and the equations S (p, p), b (p,) of their step, all poses eliminated."""
     p = len(border.theta)
     S, b, step = np.zeros((p, p)), np.zeros(p), border.unknowns.step
-    world, matched = World(take.body, take.channels.rig), Spool[tuple[Matched, ...]]()
+    world, matched = World(take.body, take.pixels.channels.rig), Spool[tuple[Matched, ...]]()
     worlds, windows = Worlds(world, (border.unknowns,)), parts(len(take.roots), window, overlap)
     roots, angles, every = np.array(take.roots), np.array(take.angles), np.ones(p, bool)
     for (whole, kept), part in zip(windows, linear_parts(take, windows, matched)):
-        fit = part.solved(strength, posture=POSTURE_SHARE)
+        fit = part.solved(posture=POSTURE_SHARE)
         inside = slice(kept.start - whole.start, kept.stop - whole.start)
         roots[kept], angles[kept] = fit.roots[inside], fit.angles[inside]
         B = np.zeros((*fit.system.g.shape, p))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +12,9 @@ from kinefit._threads import side_by_side
 from kinefit.bodies import Body
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import Channels, joined
-from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.smoothing.foot_contacts import Contacts
-from kinefit.smoothing.packed_pixels import PackedPixels
-from kinefit.smoothing.shared_errors import SharedErrors, shared_by
+from kinefit.smoothing.packed import MIN_INLIER_FACTOR, PackedMarkers, PackedPixels, PackedPoints
+from kinefit.smoothing.shared_errors import shared_by
 from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.tracked_frames import Linearised, TrackedFrames, squares_of, with_quadratic
 from kinefit.smoothing.unwrap import boxes
@@ -24,7 +22,6 @@ from kinefit.solvers.trajectory.motion_prior import MotionPrior
 from kinefit.solvers.trajectory.seen_points import SeenPoints
 from kinefit.solvers.trajectory.smoothing import Posterior, Smoothed, posterior, smooth
 
-MIN_INLIER_FACTOR = 0.25  # robust factor (Geman-McClure: within its scale) above which a residual is noise
 _MEDIAN_SQUARE_2D = 2.0 * np.log(2.0)  # median |r|² of a normal error in the plane, in σ² (Rayleigh)
 _MEDIAN_SQUARE_1D = 0.4549  # median of a squared normal variable
 _MIN_ROWS = 30  # of a sensor: with fewer its standard deviation is not estimated
@@ -38,33 +35,12 @@ _LIVELINESS_STD_S = 0.15  # [s] of the window over which a limb's liveliness is 
 
 
 @dataclass(frozen=True, eq=False)
-class Strength:
-    """Process noise and noise of keypoints, estimated from a take.
-
-    Parameters
-    ----------
-    acceleration : (n,) [m/s², rad/s²] random acceleration of every degree of freedom, one standard deviation
-    sigma : (N,) [px] noise of every channel at full confidence
-    shared : (N,) share of a channel's variance that all points of a segment share in a view
-    """
-
-    acceleration: NDArray
-    sigma: NDArray
-    shared: NDArray
-
-    def change(self, other: Strength) -> float:
-        """Largest relative difference of any estimate, unitless (a number from 0)."""
-        pairs = zip(*((s.acceleration, s.sigma) for s in (self, other)), strict=True)
-        shared = float(np.abs(self.shared - other.shared).max(initial=0.0))
-        return max(shared, *(float(np.abs(np.log(a / b)).max(initial=0.0)) for a, b in pairs))
-
-
-@dataclass(frozen=True, eq=False)
 class SmoothTake:
     """Measurements of T frames with left-right swaps corrected, and states to start from.
 
     `pixels`, `markers`: keypoints and labelled markers; `others`: frames of all other sensors, `linear` their costs at
-    the states; `observed` (T, D) bool: coordinates that a frame nearby observes on its own; `live` (T, n): liveliness,
+    the states; `acceleration` (n,) [m/s², rad/s²]: random acceleration of every degree of freedom, one standard
+    deviation; `observed` (T, D) bool: coordinates that a frame nearby observes on its own; `live` (T, n): liveliness,
     a factor on the process noise;
     `speed_std` (n,) [m/s, rad/s]: 90th percentile over frames; `one_view`: one camera is the only sensor, so no other
     view contradicts the errors of its keypoints.
@@ -72,23 +48,24 @@ class SmoothTake:
 
     body: Body
     pixels: PackedPixels
+    markers: PackedMarkers
     roots: NDArray
     angles: NDArray
     observed: NDArray
+    acceleration: NDArray
     live: NDArray
     dt: float
     memory: tuple[float, float]
     contacts: Contacts | None = None
-    markers: PackedMarkers | None = None
     others: TrackedFrames | None = None
     linear: Linearised | None = None
     speed_std: NDArray | None = None
     one_view: bool = False
 
     @property
-    def channels(self) -> Channels:
-        """Channels of the keypoints."""
-        return self.pixels.channels
+    def blocks(self) -> tuple[PackedPoints, ...]:
+        """Sensors whose points are packed."""
+        return self.pixels, self.markers
 
     def renewed(self, *, keep: bool = False) -> SmoothTake:
         """The take with all other sensors matched and linearised at its states; `keep` keeps the matches."""
@@ -102,60 +79,54 @@ class SmoothTake:
         names = ("roots", "angles", "observed", "live")
         cut = {name: getattr(self, name)[frames] for name in names}
         return replace(
-            self, **cut, pixels=self.pixels.part(frames), contacts=self.contacts and self.contacts.part(frames),
-            markers=self.markers and self.markers.part(frames),
+            self, **cut, pixels=self.pixels.part(frames), markers=self.markers.part(frames),
+            contacts=self.contacts and self.contacts.part(frames),
             others=self.others and self.others.part(frames), linear=self.linear and self.linear.part(frames),
         )  # fmt: skip
 
-    def solver_points(self, sigma: NDArray, shared: NDArray | None = None) -> SeenPoints:
-        """Keypoints, markers and contacts for the solver, with `sigma` (N,) [px] and `shared` (N,), see `Strength`."""
-        p, share = self.pixels, np.zeros(len(sigma)) if shared is None else shared
-        errors = SharedErrors.of(p.channels, share, sigma)
-        out = SeenPoints(
-            p.channels.rig, p.points, p.channels.camera, p.uv,
-            p.confidence / (np.square(sigma) * (1.0 - errors.share)), p.loss, member=errors.member,
-            shared=errors.variance,
+    def solver_points(self) -> SeenPoints:
+        """Keypoints, markers and contacts for the solver."""
+        markers, contacts = self.markers, self.contacts
+        out = replace(
+            self.pixels.for_solver(self.pixels.weight, self.pixels.loss), placed=markers.points, places=markers.values,
+            place_weight=markers.weight, place_loss=markers.loss, robust=len(markers.points),
         )  # fmt: skip
-        in_metres = [block for block in (self.markers, self.contacts) if block is not None]
-        if not in_metres:
+        if contacts is None:
             return out
-        if self.markers is not None:
-            out = replace(out, place_loss=self.markers.loss, robust=len(self.markers.points))
         return replace(
-            out, placed=joined([block.points for block in in_metres]),
-            places=np.concatenate([block.places for block in in_metres], axis=1),
-            place_weight=np.concatenate([block.weight for block in in_metres], axis=1),
+            out, placed=joined([markers.points, contacts.points]),
+            places=np.concatenate([markers.values, contacts.places], axis=1),
+            place_weight=np.concatenate([markers.weight, contacts.weight], axis=1),
         )  # fmt: skip
 
     @property
     def scale(self) -> dict[str, float]:
         """{sensor: factor on its standard deviation} of all sensors but the keypoints, a number from 1."""
-        return {**(self.markers.scale if self.markers else {}), **(self.others.scale if self.others else {})}
+        return {**self.markers.scale, **(self.others.scale if self.others else {})}
 
     def scaled(self, scale: Mapping[str, float]) -> SmoothTake:
         """The take with other factors {sensor: number from 1}."""
-        markers = self.markers and replace(self.markers, scale=_known(self.markers.scale, scale))
         others = self.others and replace(self.others, scale=_known(self.others.scale, scale))
-        return replace(self, markers=markers, others=others)
+        return replace(self, markers=replace(self.markers, scale=_known(self.markers.scale, scale)), others=others)
 
-    def fit(self, strength: Strength, *, tolerance: float = 1e-5) -> tuple[Smoothed, Posterior]:
+    def fit(self, *, tolerance: float = 1e-5) -> tuple[Smoothed, Posterior]:
         """Solve all frames jointly from the take's states, with covariances; `tolerance` is unitless."""
-        fit = self.solved(strength, tolerance=tolerance)
+        fit = self.solved(tolerance=tolerance)
         if self.linear is None or self.linear.unsupported is None:
             return fit, posterior(self.body, fit)
         measured = replace(fit.system, C=fit.system.C - self.linear.unsupported)
         return fit, posterior(self.body, replace(fit, system=measured))
 
-    def solved(self, strength: Strength, *, tolerance: float = 1e-5, posture: float = 1.0) -> Smoothed:
+    def solved(self, *, tolerance: float = 1e-5, posture: float = 1.0) -> Smoothed:
         """Solve all frames jointly from the take's states; `tolerance` is unitless, `posture` the prior's share."""
         lower, upper, mean = boxes(self.body.tree, self.angles)
         unobserved = ~self.observed.any(axis=0)  # stays at the prior mean
         lower[:, unobserved] = upper[:, unobserved] = mean[:, unobserved]
         tree = self.body.tree
         prior = MotionPrior(
-            strength.acceleration, self.memory, self.dt, mean, tree.spread / posture**0.5, self.live, tree.couplings
+            self.acceleration, self.memory, self.dt, mean, tree.spread / posture**0.5, self.live, tree.couplings
         )  # fmt: skip
-        make = self.solver_points(strength.sigma, strength.shared).equations(self.body)
+        make = self.solver_points().equations(self.body)
         dense = self.linear is not None
         if self.linear is not None:
             make = with_quadratic(self.body, make, self.linear)
@@ -163,34 +134,30 @@ class SmoothTake:
         return smooth(self.body, self.roots, self.angles, make, prior, bounds=bounds, dense=dense, tolerance=tolerance)
 
 
-def estimate(
-    takes: list[SmoothTake], settings_start: tuple[float, float], rounds: int
-) -> tuple[Strength, list[SmoothTake], int]:
+def estimate(takes: list[SmoothTake], rounds: int) -> tuple[list[SmoothTake], int]:
     """Estimate accelerations, liveliness and pixel noise by iteration to a fixed point (empirical Bayes, MacKay 1992).
 
     With γ = Σ (1 − var(r)/a²), the number of changes r that the pixels observe, a² = Σ r² / γ. Pixels likewise.
 
     Parameters
     ----------
-    takes : parts of one take
-    settings_start : [m/s²], [rad/s²] accelerations of the root and of the angles to start from
+    takes : parts of one take, with the noise to start from
     rounds : int, at most
 
     Returns
     -------
-    strength, the parts with their last states and liveliness, and the number of rounds
+    the parts with their noise, last states and liveliness, and the number of rounds
     """
-    body, channels, n = takes[0].body, takes[0].channels, takes[0].body.tree.n_dofs
-    start = np.where(np.arange(n) < 3, *settings_start)
-    strength = Strength(start, np.array(channels.sigma), np.zeros(len(channels.sigma)))
+    first = takes[0]
+    body, channels, start = first.body, first.pixels.channels, first.acceleration
     groups, limb, count = noise_groups(body), limbs(body), 0
     takes = list(takes)
     while count < rounds:
         count += 1
-        squares, informed, level = np.zeros((3, n))
+        squares, informed, level = np.zeros((3, body.tree.n_dofs))
         errors: list[tuple[NDArray, NDArray, NDArray]] = []
         takes = [take.renewed(keep=True) for take in takes]
-        for fitted in side_by_side(partial(_roughly, strength), list(takes)):
+        for fitted in side_by_side(_roughly, list(takes)):
             i, (fit, post) = len(errors), fitted
             take = takes[i]
             of_r, of_gamma = _changes(take, fit, post)
@@ -198,40 +165,45 @@ def estimate(
             live = _liveliness(body, take.dt, of_r, of_gamma)
             level += (of_gamma * np.log(live)).sum(axis=0)
             takes[i] = replace(take, roots=fit.roots, angles=fit.angles, live=live)
-            errors.append(_pixels(takes[i], strength, post))
+            errors.append(_pixels(takes[i], post))
             del fitted, fit, post  # 100 MB for 600 frames, while two more parts are fitted
+        before, pixels = takes[0].acceleration, takes[0].pixels
         level = np.bincount(limb, level) / np.maximum(np.bincount(limb, informed), 1e-12)  # goes to the accelerations
-        takes = [replace(take, live=take.live / np.exp(level[limb])) for take in takes]
-        acceleration = _accelerations(squares, informed, start / strength.acceleration, groups) * strength.acceleration
-        looks = min(takes[0].dt / DETECTOR_CORRELATION_TIME, 1.0)
+        acceleration = _accelerations(squares, informed, start / before, groups) * before
+        looks = min(first.dt / DETECTOR_CORRELATION_TIME, 1.0)
         residuals, r2, variance = (np.concatenate(p) for p in zip(*errors, strict=True))
         sigma, shared = _noise(channels, r2, variance, looks), shared_by(channels, residuals, variance, looks)
         sigma = np.maximum(sigma, _MIN_SIGMA_RATIO * channels.sigma)
-        if takes[0].one_view:  # the pose absorbs systematic errors of the only view: residuals show jitter alone
+        if first.one_view:  # the pose absorbs systematic errors of the only view: residuals show jitter alone
             sigma, shared = np.maximum(sigma, channels.sigma), np.zeros(len(sigma))
-        found = Strength(acceleration, sigma, shared)
-        change = found.change(strength)
-        strength = found
-        scale = sensor_scales(takes)
-        change = max(change, _largest_change(takes[0].scale, scale))
-        takes = [take.scaled(scale) for take in takes]
-        if change < _MAX_RELATIVE_CHANGE:
+        scale, known = sensor_scales(takes), takes[0].scale
+        changes = [
+            np.abs(shared - pixels.errors.share), np.abs(np.log(acceleration / before)),
+            np.abs(np.log(sigma / pixels.sigma)), [abs(np.log(v / known.get(name, 1.0))) for name, v in scale.items()],
+        ]  # fmt: skip
+        takes = [
+            replace(
+                take, acceleration=acceleration, live=take.live / np.exp(level[limb]),
+                pixels=take.pixels.with_noise(sigma, shared),
+            ).scaled(scale) for take in takes
+        ]  # fmt: skip
+        if np.concatenate(changes).max() < _MAX_RELATIVE_CHANGE:
             break
-    return strength, takes, count
+    return takes, count
 
 
-def _roughly(strength: Strength, take: SmoothTake) -> tuple[Smoothed, Posterior]:
-    return take.fit(strength, tolerance=1e-3)
+def _roughly(take: SmoothTake) -> tuple[Smoothed, Posterior]:
+    return take.fit(tolerance=1e-3)
 
 
-def estimate_liveliness(take: SmoothTake, strength: Strength, rounds: int = 3) -> SmoothTake:
-    """The take with its liveliness estimated, for a known strength; its states are those of the last round.
+def estimate_liveliness(take: SmoothTake, rounds: int = 3) -> SmoothTake:
+    """The take with its liveliness estimated, for known noise; its states are those of the last round.
 
     `rounds` is the most; they end when no liveliness changes by more than a twentieth.
     """
     for _ in range(rounds):
         take = take.renewed()
-        fit, post = _roughly(strength, take)
+        fit, post = _roughly(take)
         live = _liveliness(take.body, take.dt, *_changes(take, fit, post))
         change = float(np.abs(np.log(live / take.live)).max())
         take = replace(take, roots=fit.roots, angles=fit.angles, live=live)
@@ -248,13 +220,12 @@ def sensor_scales(takes: list[SmoothTake]) -> dict[str, float]:
     squares: dict[str, list[NDArray]] = {}
     skipped: set[str] = set()  # sensors whose rows, of one kind in all frames, have no residuals to estimate noise from
     for take in takes:
-        if take.markers is not None:
-            gaps = take.markers.gaps(take.body, take.roots, take.angles)
-            inlier = take.markers.factors(gaps) > MIN_INLIER_FACTOR
-            square = take.markers.stated[..., None] * np.square(gaps)
-            for sensor in take.markers.sensors:
-                own = take.markers.columns(sensor)
-                squares.setdefault(sensor, []).append(square[:, own][inlier[:, own]].ravel())
+        gaps = take.markers.gaps(take.body, take.roots, take.angles)
+        inlier = take.markers.factors(gaps) > MIN_INLIER_FACTOR
+        square = take.markers.stated[..., None] * np.square(gaps)
+        for sensor in take.markers.sensors:
+            own = take.markers.columns(sensor)
+            squares.setdefault(sensor, []).append(square[:, own][inlier[:, own]].ravel())
         if take.others is None or take.linear is None:
             continue
         for f, matched in enumerate(take.linear.matched):
@@ -276,10 +247,6 @@ def sensor_scales(takes: list[SmoothTake]) -> dict[str, float]:
 
 def _known(old: Mapping[str, float], new: Mapping[str, float]) -> dict[str, float]:
     return {name: new.get(name, value) for name, value in old.items()}
-
-
-def _largest_change(old: dict[str, float], new: dict[str, float]) -> float:
-    return max((abs(np.log(v / old.get(name, 1.0))) for name, v in new.items()), default=0.0)
 
 
 def _changes(take: SmoothTake, fit: Smoothed, post: Posterior) -> tuple[NDArray, NDArray]:
@@ -315,13 +282,13 @@ def _accelerations(squares: NDArray, informed: NDArray, start: NDArray, groups: 
     return np.asarray(np.exp(share * own + (1.0 - share) * np.log(start)))
 
 
-def _pixels(take: SmoothTake, strength: Strength, post: Posterior) -> tuple[NDArray, NDArray, NDArray]:
+def _pixels(take: SmoothTake, post: Posterior) -> tuple[NDArray, NDArray, NDArray]:
     """Residuals (T, N, 2) [px], NaN for outliers; squared at full confidence (T, N), and the fit's variance [px²]."""
     block = take.pixels
     gaps = block.gaps(take.body, take.roots, take.angles)
-    inside = block.factors(gaps, strength.sigma) > MIN_INLIER_FACTOR
+    inside = block.factors(gaps) > MIN_INLIER_FACTOR
     r2 = block.confidence * np.square(gaps).sum(axis=2)
-    points = take.solver_points(strength.sigma)
+    points = block.for_solver(block.weight, block.loss)
     variance = points.variance(take.body, take.roots, take.angles, post.frames).sum(axis=2)
     residuals = np.where(inside[..., None], gaps, np.nan)
     return residuals, np.where(inside, r2, np.nan), np.where(inside, block.confidence * variance, np.nan)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,14 +21,11 @@ from kinefit.rows import DofRows, Rows, weaker
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import ChannelResiduals
 from kinefit.sensors.points.markers import MarkerMatched
-from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.smoothing.tracked_frames import TrackedFrames, squares_of
 from kinefit.solvers.bundle.border_frames import gram
 from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, point_derivatives, product
-from kinefit.solvers.trajectory.seen_points import SeenPoints
-from kinefit.solvers.trajectory.smoothing import unpacked
 from kinefit.solvers.trajectory.variance_components import VarianceComponents, variance_components
 
 _RIGID_SURFACE_STDS = 1e-6, 1e-6  # [m], [rad] of surface offsets of a body without joints: it is its surface
@@ -36,8 +34,8 @@ _LEVERAGE_FRAMES = 40  # of a take, in which the leverage of each channel is com
 _STATED_CHANNELS = 5.0  # channels along one axis, without leverage, that a stated systematic error counts as
 
 
-_Push = tuple[str, NDArray, NDArray, NDArray]
-"""Rows of one sensor in one frame: its name; channels and axes (2, R), Σ w J (R, n) and Σ w (R,) of each."""
+_Push = tuple[NDArray, NDArray, NDArray]
+"""Rows of one sensor in one frame: channels and axes (2, R), Σ w J (R, n) and Σ w (R,) of each."""
 
 
 class Pushes(NamedTuple):
@@ -47,7 +45,7 @@ class Pushes(NamedTuple):
     ----------
     constant, drift : (k, n) of errors that last for the whole take, and of those that drift
     rest : (n, n) Σ s sᵀ of the gradients s of errors that are others in every frame
-    surplus : (n, n) Σ s sᵀ of what the fit assumes beyond the jitter, see `LastingPushes`
+    surplus : (n, n) Σ s sᵀ of what the fit assumes beyond white errors, see `LastingPushes`
     """
 
     constant: NDArray
@@ -55,15 +53,10 @@ class Pushes(NamedTuple):
     rest: NDArray
     surplus: NDArray
 
-    @classmethod
-    def none(cls, n: int) -> Pushes:
-        """Of no sensor."""
-        return cls(np.zeros((0, n)), np.zeros((0, n)), *np.zeros((2, n, n)))
-
 
 @dataclass(frozen=True, eq=False)
 class LastingPushes:
-    """Gradients by the systematic errors of sensors of one kind, in some frames.
+    """Gradients by the systematic errors of one sensor, in some frames.
 
     Parameters
     ----------
@@ -80,33 +73,57 @@ class LastingPushes:
 
 
 @dataclass(frozen=True, eq=False)
+class _SensorErrors:
+    """What shows the errors of one sensor of C channels along A axes.
+
+    Parameters
+    ----------
+    residuals : (T, C, A) [m], NaN where unobserved
+    assumed, stated : (C, A) [m²] variance that the fit assumes, and what is stated to last of it
+    independent : whether channels err independently
+    pushes : frame -> its rows
+    """
+
+    residuals: NDArray
+    assumed: NDArray
+    stated: NDArray
+    independent: bool
+    pushes: Callable[[int], Sequence[_Push]]
+
+
+@dataclass(frozen=True, eq=False)
 class OtherNoise:
     """Information and systematic errors of all sensors but the keypoints.
 
     Parameters
     ----------
     information : (T, n (n + 1) / 2) of every frame's rows, the upper triangle of each
-    rest : (T, n (n + 1) / 2) as in `Pushes`
-    lasting : of each kind of sensor
+    rest : (T, n (n + 1) / 2) as in `Pushes`, of every frame alone
+    half : frames to either side within the correlation time of the motion, over which both are averaged
+    lasting : of each sensor
     frames : (K,) int, increasing, those of `lasting`
     components : {sensor: VarianceComponents [m]}
     """
 
     information: NDArray
     rest: NDArray
+    half: int
     lasting: tuple[LastingPushes, ...]
     frames: NDArray
     components: dict[str, VarianceComponents]
 
-    def pooled(self, f: int, half: int) -> NDArray:
-        """(n, n) information, averaged over `half` (int) frames to either side."""
-        return _square(self.information[max(f - half, 0) : f + half + 1].mean(axis=0))
+    def near(self, f: int) -> slice:
+        """The frames within the correlation time of frame `f`."""
+        return slice(max(f - self.half, 0), f + self.half + 1)
+
+    def pooled(self, f: int) -> NDArray:
+        """(n, n) information near frame `f`."""
+        return square(self.information[self.near(f)].mean(axis=0))
 
     def pushes(self, f: int) -> Pushes:
         """Of one of `frames`."""
-        k, rest = int(np.searchsorted(self.frames, f)), _square(self.rest[f])
-        per_unit = [one.per_unit[k] for one in self.lasting]
-        none, pushes = np.zeros((0, len(rest))), list(zip((one.stds for one in self.lasting), per_unit))
+        k, rest = int(np.searchsorted(self.frames, f)), square(self.rest[self.near(f)].mean(axis=0))
+        none, pushes = np.zeros((0, len(rest))), [(one.stds, one.per_unit[k]) for one in self.lasting]
         constant, drift, surplus = (
             np.concatenate([none, *(stds[part][:, None] * push for stds, push in pushes)]) for part in range(3)
         )
@@ -114,15 +131,8 @@ class OtherNoise:
 
     @property
     def drift_times(self) -> list[float]:
-        """[s] of each kind of sensor that drifts."""
+        """[s] of each sensor that drifts."""
         return [one.drift_time for one in self.lasting if np.any(one.stds[1] > 0.0)]
-
-    def __add__(self, other: OtherNoise) -> OtherNoise:
-        """The noise of both, of different sensors."""
-        return OtherNoise(
-            self.information + other.information, self.rest + other.rest, self.lasting + other.lasting, self.frames,
-            {**self.components, **other.components},
-        )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
         """The variance components in a few numbers, by sensor."""
@@ -160,30 +170,60 @@ def leverages(J: NDArray, pushed: NDArray, alone: NDArray) -> NDArray:
     return np.asarray(1.0 - np.sum(residual**2, axis=1))
 
 
-def other_noise(
-    body: Body, others: TrackedFrames, matched: Sequence[tuple[Matched, ...]], roots: NDArray, angles: NDArray,
-    pixels: Callable[[int], NDArray], *, half: int = 0, surfaces: bool = True, frames: NDArray | None = None,
+def noise_of_sensors(
+    take: SmoothTake, matched: Sequence[tuple[Matched, ...]] | None, *, half: int = 0, surfaces: bool = True,
+    frames: NDArray | None = None,
 ) -> OtherNoise:  # fmt: skip
-    """Estimate the noise of all sensors but the keypoints from their residuals at fitted states.
+    """Estimate the noise of all sensors but the keypoints from their residuals at the states of a take.
 
     Parameters
     ----------
-    matched : T lists of matches
-    roots, angles : (T, 4, 4), (T, D) fitted
-    pixels : frame -> (n, n) information of its keypoints
+    matched : T lists of matches of `take.others`; None without them
     half : frames to either side within the correlation time of the motion
     surfaces : whether surface offsets count as systematic errors
     frames : (K,) int, increasing, in which systematic errors are asked for; default: all
     """
-    T = len(roots)
-    upper, frames = np.triu_indices(body.tree.n_dofs), np.arange(T) if frames is None else frames
-    information, skins, rest = np.zeros((3, T, len(upper[0])))
-    residuals, pushes = ChannelResiduals(), Spool[list[_Push]]()
-    absorbed, stated, assumed = (defaultdict[str, list[NDArray]](list) for _ in range(3))
-    independent = set[str]()
-    leverage_frames = set(np.linspace(0, T - 1, min(_LEVERAGE_FRAMES, T)).astype(int).tolist())
-    for f in range(T):
-        scene, surface, pushed = others.scene(f, roots, angles), list[Rows](), list[_Push]()
+    body, T, n = take.body, len(take.roots), take.body.tree.n_dofs
+    shape, upper, errors = (T, n * (n + 1) // 2), np.triu_indices(n), dict[str, _SensorErrors]()
+    information = rest = np.broadcast_to(0.0, shape)
+    if take.markers.sensors:
+        information = room(shape)
+        errors |= _of_markers(take, information)
+        # Neighbouring frames repeat the same error of the prior, which counts where the cost is flat.
+        rest = np.broadcast_to(block_diagonal(np.zeros((6, 6)), body.tree.posture_precision)[upper], shape)
+    if take.others is not None and matched is not None:
+        information, rest = (np.add(values, 0.0, out=room(shape)) for values in (information, rest))
+        errors |= _of_rows(take, take.others, matched, information, rest, surfaces=surfaces)
+    absorbed = defaultdict[str, list[NDArray]](list)
+    for f in np.linspace(0, T - 1, min(_LEVERAGE_FRAMES, T)).astype(int) if errors else ():
+        one, state = slice(f, f + 1), BodyState(take.roots[f], take.angles[f])
+        whole = take.pixels.part(one).information(body, take.roots[one], take.angles[one])[0]
+        alone = covariance_alone(body, state, whole + square(information[f]))
+        for sensor, of in errors.items():
+            for at, push, weight in of.pushes(f):
+                absorbed[sensor].append(np.vstack([at, leverages(push / weight[:, None], push, alone)]))
+    lasting, found = list[LastingPushes](), dict[str, VarianceComponents]()
+    asked = np.arange(T) if frames is None else frames
+    for sensor, of in errors.items():
+        leverage = _means(absorbed[sensor], of.residuals.shape[1:]).mean(axis=1)
+        noise = variance_components(of.residuals, take.markers.times, leverage=leverage, window=2 * half + 1)
+        stds = _lasting(noise, leverage, of)
+        per_unit = Spool(_with_shared(mean).astype(np.float32) for mean in _window_means(of, half, asked, n))
+        lasting.append(LastingPushes(per_unit, stds.reshape(3, -1), noise.drift_time))
+        found[sensor] = noise
+    return OtherNoise(information, rest, half, tuple(lasting), asked, found)
+
+
+def _of_rows(
+    take: SmoothTake, others: TrackedFrames, matched: Sequence[tuple[Matched, ...]], information: NDArray,
+    rest: NDArray, *, surfaces: bool,
+) -> dict[str, _SensorErrors]:  # fmt: skip
+    """Errors of all sensors of which there are rows; adds to `information` and `rest`, see `OtherNoise`."""
+    body, upper = take.body, np.triu_indices(take.body.tree.n_dofs)
+    residuals, pushes = ChannelResiduals(), Spool[list[tuple[str, _Push]]]()
+    variance, independent = defaultdict[str, list[NDArray]](list), set[str]()
+    for f in range(len(take.roots)):
+        scene, surface, pushed = others.scene(f, take.roots, take.angles), list[Rows](), list[tuple[str, _Push]]()
         for m in matched[f]:
             scale = others.scale.get(m.sensor, 1.0)
             made = [r for r in rows_at(m, scene) if isinstance(r, Rows | DofRows) and len(r)]
@@ -194,9 +234,9 @@ def other_noise(
                 used = w > 0.0
                 J, w, at = design(body, scene.state, rows)[used], w[used], at[:, used]
                 information[f] += gram(J, w[:, None] * J)[upper]
-                pushed.append((m.sensor, *_summed(at, w[:, None] * J, w)))
-                stated[m.sensor].append(np.vstack([at, m.lasts / rows.weight[used]]))
-                assumed[m.sensor].append(np.vstack([at, scale**2 / rows.weight[used]]))
+                pushed.append((m.sensor, _summed(at, w[:, None] * J, w)))
+                assumed = scale**2 / rows.weight[used]
+                variance[m.sensor].append(np.vstack([at, assumed, m.lasts / rows.weight[used]]))
                 independent |= {m.sensor} if m.independent else set()
         if surface:
             settings = others.tracker.settings
@@ -206,140 +246,46 @@ def other_noise(
             information[f] += (skin.exact_information if exact else skin.information)[upper]
             if surfaces:
                 pushed_by_skin = skin.exact_pushes if exact else skin.pushes
-                skins[f] += gram(pushed_by_skin, pushed_by_skin)[upper]
-        if f in leverage_frames:
-            alone = covariance_alone(body, scene.state, _square(information[f]) + pixels(f))
-            for sensor, at, push, weight in pushed:
-                absorbed[sensor].append(np.vstack([at, leverages(push / weight[:, None], push, alone)]))
+                rest[f] += gram(pushed_by_skin, pushed_by_skin)[upper]
         pushes.append(pushed)
-    found, stds = {}, {}
-    for sensor, (values, _) in residuals.arrays(T).items():
-        leverage = _means(absorbed[sensor], values.shape[1:]).mean(axis=1)
-        noise = variance_components(values, others.times, leverage=leverage, window=2 * half + 1)
-        found[sensor] = noise
-        systematic, white = (_means(of[sensor], values.shape[1:]) for of in (stated, assumed))
-        stds[sensor] = _lasting(noise, leverage, systematic, white, sensor in independent)
-    per_unit, asked = {sensor: Spool[NDArray]() for sensor in found}, set(frames.tolist())
-    for f, (near, sums) in enumerate(_window_means(pushes, half, stds, body.tree.n_dofs)):
-        rest[f] = skins[near].mean(axis=0)
-        for sensor, mean in sums.items() if f in asked else ():
-            per_unit[sensor].append(_with_shared(mean).astype(np.float32))
-    lasting = tuple(
-        LastingPushes(per_unit[sensor], of.reshape(3, -1), found[sensor].drift_time) for sensor, of in stds.items()
-    )  # fmt: skip
-    return OtherNoise(information, rest, lasting, frames, found)
 
+    def pushes_of(f: int, sensor: str) -> list[_Push]:
+        return [push for name, push in pushes[f] if name == sensor]
 
-def noise_of_sensors(
-    take: SmoothTake, matched: Sequence[tuple[Matched, ...]] | None, pixels: Callable[[int], NDArray], *,
-    half: int = 0, surfaces: bool = True, frames: NDArray | None = None,
-) -> OtherNoise | None:  # fmt: skip
-    """Estimate the noise of all sensors but the keypoints, packed markers too; None without such sensors.
-
-    Parameters
-    ----------
-    matched : T lists of matches of `take.others`; None without them
-    pixels, half, surfaces, frames : see `other_noise`
-    """
-    body, roots, angles, markers = take.body, take.roots, take.angles, take.markers
-    of_markers = None if markers is None else marker_information(body, markers, roots, angles)
-
-    def points(f: int) -> NDArray:
-        return pixels(f) if of_markers is None else pixels(f) + _square(of_markers[f])
-
-    others = None
-    if take.others is not None and matched is not None:
-        others = other_noise(
-            body, take.others, matched, roots, angles, points, half=half, surfaces=surfaces, frames=frames
-        )
-    if markers is None or of_markers is None:
-        return others
-
-    def rest(f: int) -> NDArray:
-        return pixels(f) if others is None else pixels(f) + _square(others.information[f])
-
-    found = marker_noise(body, markers, of_markers, roots, angles, rest, half=half, frames=frames)
-    return found if others is None else found + others
-
-
-def marker_information(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> NDArray:
-    """(T, n (n + 1) / 2) information of packed markers at fitted states, the upper triangle of each frame."""
-    upper = np.triu_indices(body.tree.n_dofs)
-    out = room((len(roots), len(upper[0])))
-    for some in stretches(len(roots), MATRIX_FRAMES):
-        whole = marker_matrices(body, markers.part(some), roots[some], angles[some])
-        out[some] = whole[:, upper[0], upper[1]]
+    out = dict[str, _SensorErrors]()
+    for sensor, (values, _) in residuals.arrays(len(take.roots)).items():
+        assumed, stated = (_means([one[[0, 1, k]] for one in variance[sensor]], values.shape[1:]) for k in (2, 3))
+        of_sensor = partial(pushes_of, sensor=sensor)
+        out[sensor] = _SensorErrors(values, assumed, stated, sensor in independent, of_sensor)
     return out
 
 
-def marker_matrices(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray) -> NDArray:
-    """(T, n, n) information of packed markers at fitted states."""
-    weight = markers.factors(markers.gaps(body, roots, angles)) * markers.weight
-    packed, _, _ = SeenPoints.in_metres(markers.points, markers.places, weight).equations(body)(roots, angles)
-    return unpacked(packed, body.tree)
+def _of_markers(take: SmoothTake, information: NDArray) -> dict[str, _SensorErrors]:
+    """Errors of packed markers by sensor; fills in `information`, see `OtherNoise`."""
+    body, markers, n = take.body, take.markers, take.body.tree.n_dofs
+    upper, gaps, weight = np.triu_indices(n), room(markers.values.shape), room(markers.stated.shape)
+    for some in stretches(len(gaps), MATRIX_FRAMES):
+        part, at = markers.part(some), (take.roots[some], take.angles[some])
+        information[some] = part.information(body, *at)[:, upper[0], upper[1]]
+    for some, part, of_part in markers.stretched(body, take.roots, take.angles):
+        gaps[some], weight[some] = of_part, part.factors(of_part) * part.weight
 
+    def pushes(f: int, own: NDArray) -> list[_Push]:
+        seen = np.flatnonzero(weight[f, own] > 0.0)
+        J = point_derivatives(body, BodyState(take.roots[f], take.angles[f]), markers.points)[own[seen]].reshape(-1, n)
+        w = np.repeat(weight[f, own[seen]], 3)
+        return [(np.stack([np.repeat(seen, 3), np.tile(np.arange(3), len(seen))]), w[:, None] * J, w)]
 
-def marker_noise(
-    body: Body, markers: PackedMarkers, information: NDArray, roots: NDArray, angles: NDArray,
-    rest: Callable[[int], NDArray], *, half: int = 0, frames: NDArray | None = None,
-) -> OtherNoise:  # fmt: skip
-    """Estimate the noise of packed markers from their residuals at fitted states, as `other_noise` does.
-
-    Parameters
-    ----------
-    information : of `marker_information`
-    roots, angles : (T, 4, 4), (T, D) fitted
-    rest : frame -> (n, n) information of all other sensors, keypoints too
-    half, frames : see `other_noise`
-    """
-    T, K = len(roots), len(markers.points)
-    frames = np.arange(T) if frames is None else frames
-    gaps, weight = room(markers.places.shape), room(markers.stated.shape)
-    for some in stretches(T):
-        part = markers.part(some)
-        gaps[some] = part.gaps(body, roots[some], angles[some])
-        weight[some] = part.factors(gaps[some]) * part.weight
-    absorbed, count = np.zeros(K), np.zeros(K)
-    for f in np.linspace(0, T - 1, min(_LEVERAGE_FRAMES, T)).astype(int):
-        state = BodyState(roots[f], angles[f])
-        J = point_derivatives(body, state, markers.points)
-        alone = covariance_alone(body, state, _square(information[f]) + rest(f))
-        for sensor in markers.sensors:
-            own = markers.columns(sensor)
-            own = own[weight[f, own] > 0.0]
-            lines, w = J[own].reshape(-1, body.tree.n_dofs), np.repeat(weight[f, own], 3)[:, None]
-            absorbed[own] += leverages(lines, w * lines, alone).reshape(-1, 3).mean(axis=1)
-            count[own] += 1
-    found, stds, drift_time = {}, {}, np.inf
+    out = dict[str, _SensorErrors]()
     for sensor in markers.sensors:
         own = markers.columns(sensor)
-        leverage = filled(absorbed[own], count[own])
-        noise = variance_components(gaps[:, own], markers.times, leverage=leverage, window=2 * half + 1)
-        seen = weight[:, own] > 0.0
-        stated = np.where(seen, 1.0 / np.where(seen, markers.stated[:, own], 1.0), 0.0)
-        assumed = np.repeat(filled(stated.sum(axis=0), np.count_nonzero(seen, axis=0))[:, None], 3, axis=1)
-        found[sensor], drift_time = noise, min(drift_time, noise.drift_time)
-        stds[sensor] = _lasting(noise, leverage, MarkerMatched.lasts * assumed, assumed, MarkerMatched.independent)
-    per_unit = Spool[NDArray]()
-    for some in stretches(T, MATRIX_FRAMES):
-        asked = frames[(frames >= some.start) & (frames < some.stop)]
-        first, stop = np.maximum(asked - half, 0), np.minimum(asked + half + 1, T)
-        if not len(asked):
-            continue
-        pushes = np.zeros((stop[-1] - first[0] + 1, K, 3, body.tree.n_dofs))
-        for f in range(first[0], stop[-1]):
-            pushes[f - first[0] + 1] = weight[f, :, None, None] * point_derivatives(
-                body, BodyState(roots[f], angles[f]), markers.points
-            )
-        total = np.cumsum(pushes, axis=0)
-        for mean in (total[stop - first[0]] - total[first - first[0]]) / (stop - first)[:, None, None, None]:
-            of_sensors = [_with_shared(mean[markers.columns(sensor)]) for sensor in markers.sensors]
-            per_unit.append(np.concatenate(of_sensors).astype(np.float32))
-    lasting = LastingPushes(per_unit, np.concatenate([of.reshape(3, -1) for of in stds.values()], axis=1), drift_time)
-    posture = block_diagonal(np.zeros((6, 6)), body.tree.posture_precision)
-    # Neighbouring frames repeat the same error of the prior, which counts where the cost is flat.
-    of_prior = np.broadcast_to(posture[np.triu_indices(len(posture))], information.shape)
-    return OtherNoise(information, of_prior, (lasting,), frames, found)
+        used = weight[:, own] > 0.0
+        variance = np.where(used, 1.0 / np.where(used, markers.stated[:, own], 1.0), 0.0)
+        assumed = np.repeat(filled(variance.sum(axis=0), np.count_nonzero(used, axis=0))[:, None], 3, axis=1)
+        out[sensor] = _SensorErrors(
+            gaps[:, own], assumed, MarkerMatched.lasts * assumed, MarkerMatched.independent, partial(pushes, own=own)
+        )  # fmt: skip
+    return out
 
 
 def filled(total: NDArray, count: NDArray) -> NDArray:
@@ -347,24 +293,23 @@ def filled(total: NDArray, count: NDArray) -> NDArray:
     return np.where(count > 0, total / np.maximum(count, 1), total.sum() / max(float(count.sum()), 1.0))
 
 
-def _lasting(
-    found: VarianceComponents, leverage: NDArray, stated: NDArray, assumed: NDArray, independent: bool
-) -> NDArray:
+def _lasting(found: VarianceComponents, leverage: NDArray, of: _SensorErrors) -> NDArray:
     """(3, C + 1, A) standard deviations of constant errors and of those that drift, and the surplus of `LastingPushes`.
 
-    The last of C + 1 is what channels share. The surplus is what `assumed` (C, A), a variance, exceeds white errors by.
-    What `stated` (C, A), a variance, exceeds the estimate by, drifts: at least for as long as a posture lasts. A share
-    of it counts, which falls with the number of independent channels, each counted by 1 − leverage (C,): their
-    residuals would show a larger error. `stated` itself counts as `_STATED_CHANNELS` channels. If channels are not
-    independent, the fit absorbs their common error, and the share is 1.
+    The last of C + 1 is what channels share. What is stated beyond the estimate drifts: at least for as long as a
+    posture lasts. A share of it counts, which falls with the number of independent channels, each counted by
+    1 − leverage (C,): their residuals would show a larger error. The statement itself counts as `_STATED_CHANNELS`
+    channels. If channels are not independent, the fit absorbs their common error, and the share is 1.
     """
-    channels = stated.shape[1] * float(np.sum(np.clip(1.0 - leverage, 0.0, 1.0))) if independent else 0.0
+    axes = of.stated.shape[1]
+    channels = axes * float(np.sum(np.clip(1.0 - leverage, 0.0, 1.0))) if of.independent else 0.0
     share = _STATED_CHANNELS / (_STATED_CHANNELS + channels)
-    excess = share * np.maximum(stated - found.systematic[:, None] ** 2, 0.0)
-    constant = np.broadcast_to(np.hypot(found.bias, found.bias_error)[:, None], stated.shape)
+    excess = share * np.maximum(of.stated - found.systematic[:, None] ** 2, 0.0)
+    constant = np.broadcast_to(np.hypot(found.bias, found.bias_error)[:, None], of.stated.shape)
     drift = np.sqrt(found.smoothed_drift[:, None] ** 2 + excess)
-    surplus, none = np.sqrt(np.maximum(assumed - found.white[:, None] ** 2, 0.0)), np.zeros(stated.shape[1])
-    return np.stack([np.vstack(one) for one in ((constant, found.shared[0]), (drift, none), (surplus, none))])
+    surplus = np.sqrt(np.maximum(of.assumed - found.white[:, None] ** 2, 0.0))
+    shared = found.shared[0], np.zeros(axes), np.zeros(axes)
+    return np.stack([np.vstack(one) for one in zip((constant, drift, surplus), shared)])
 
 
 def _with_shared(pushes: NDArray) -> NDArray:
@@ -390,21 +335,23 @@ def _means(entries: Sequence[NDArray], shape: tuple[int, ...]) -> NDArray:
     return np.where(count > 0, total / np.maximum(count, 1), np.mean(value) if len(value) else 0.0)
 
 
-def _window_means(
-    pushes: Spool[list[_Push]], half: int, stds: Mapping[str, NDArray], n: int
-) -> Iterator[tuple[slice, dict[str, NDArray]]]:
-    """For every frame the window of `half` frames to either side, and each sensor's mean w J (C, A, n) over it."""
-    T, sums = len(pushes), {sensor: np.zeros((std.shape[1] - 1, std.shape[2], n)) for sensor, std in stds.items()}
-    for last in range(T + half):
-        for f, sign in ((last, 1.0), (last - 2 * half - 1, -1.0)):
-            for sensor, at, push, _ in pushes[f] if 0 <= f < T else ():
-                sums[sensor][at[0], at[1]] += sign * push
-        if last >= half:
-            near = slice(max(last - 2 * half, 0), min(last + 1, T))
-            yield near, {sensor: total / (near.stop - near.start) for sensor, total in sums.items()}
+def _window_means(of: _SensorErrors, half: int, frames: NDArray, n: int) -> Iterator[NDArray]:
+    """Mean w J (C, A, n) over the window of `half` frames to either side, for each of `frames` (K,)."""
+    T = len(of.residuals)
+    for some in stretches(T, MATRIX_FRAMES):
+        asked = frames[(frames >= some.start) & (frames < some.stop)]
+        if not len(asked):
+            continue
+        first, stop = np.maximum(asked - half, 0), np.minimum(asked + half + 1, T)
+        total = np.zeros((stop[-1] - first[0] + 1, *of.residuals.shape[1:], n))
+        for f in range(first[0], stop[-1]):
+            for at, push, _ in of.pushes(f):
+                total[f - first[0] + 1, at[0], at[1]] += push
+        np.cumsum(total, axis=0, out=total)
+        yield from (total[stop - first[0]] - total[first - first[0]]) / (stop - first)[:, None, None, None]
 
 
-def _square(packed: NDArray) -> NDArray:
+def square(packed: NDArray) -> NDArray:
     """Symmetric (n, n) from its upper triangle (n (n + 1) / 2,)."""
     out = np.empty((int(np.sqrt(2.0 * len(packed))),) * 2)
     upper = np.triu_indices(len(out))

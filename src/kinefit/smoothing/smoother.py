@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,11 +17,11 @@ from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult, frame_resul
 from kinefit.frame.trust import unknown_joints
 from kinefit.sensors.base import Matched
 from kinefit.sensors.evidence import moves_points, near
+from kinefit.sensors.points.keypoints import pixels_of
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.border import Border, with_border
 from kinefit.smoothing.foot_contacts import find_contacts
-from kinefit.smoothing.process_noise import MIN_INLIER_FACTOR, SmoothTake, Strength, estimate, estimate_liveliness
-from kinefit.smoothing.shared_errors import SharedErrors
+from kinefit.smoothing.process_noise import SmoothTake, estimate, estimate_liveliness
 from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.smoothing.unwrap import unwrap
@@ -46,18 +45,14 @@ class SmoothedTake:
     results : F frames, with the matches of keypoints alone; read on demand
     take : SmoothTake at the solution
     matched : F lists, the matches of all sensors but keypoints and packed markers; None if there are none
-    weight : (F, N) [1/px²] of every channel in the fit, robust factor included
     provenance : estimated noise, for `Motion.provenance`
-    shared : errors that keypoints of one segment share, as the fit assumed them
     border : the sensors' own unknowns as the whole take tells them; None where there are none
     """
 
     results: Sequence[FrameResult]
     take: SmoothTake
     matched: Sequence[tuple[Matched, ...]] | None
-    weight: NDArray
     provenance: dict[str, Any]
-    shared: SharedErrors
     border: Border | None = None
 
 
@@ -82,25 +77,22 @@ def smooth_results(
     """
     body, settings = frames.tracker.body, frames.tracker.settings
     take = replace(_take(as_tracked(frames), settings), one_view=eye is not None)
-    strength, take, rounds = _estimate(take, settings, *windows)
+    take, rounds = _estimate(take, settings, *windows)
     if border is not None and take.others is not None:
-        take, border = with_border(take, strength, border, *windows)
-    take, covariances, others_matched = solved_with_covariances(take, strength, *windows)
+        take, border = with_border(take, border, *windows)
+    take, covariances, others_matched = solved_with_covariances(take, *windows)
     swaps = take.pixels.find_swaps(body, take.roots, take.angles)
     if not np.array_equal(swaps, take.pixels.swapped):
         take = replace(take, pixels=take.pixels.swapped_as(swaps, body, take.roots, take.angles))
-        take, covariances, others_matched = solved_with_covariances(take, strength, *windows)
+        take, covariances, others_matched = solved_with_covariances(take, *windows)
     for _ in range(_CONTACT_ROUNDS if contacts else 0):  # covariances stay those without: a contact is no measurement
         found = find_contacts(body, take.roots, take.angles, frames.tracker.rate, up, eye, level=level)
-        take, others_matched = solved(replace(take, contacts=found), strength, *windows)
+        take, others_matched = solved(replace(take, contacts=found), *windows)
     take = replace(take, angles=unwrap(body.tree, take.angles))
     hard = hard_equations(body)
     take = take if hard is None else _closed(take, hard)
-    # Outliers and quality use the stated standard deviations, as in tracking: they compare between takes.
-    fit_weight = take.pixels.weights(body, take.roots, take.angles, strength.sigma)
     smoothed = _results(take, frames, covariances, others_matched, hard)
-    shared = SharedErrors.of(take.channels, strength.shared, strength.sigma)
-    return SmoothedTake(smoothed, take, others_matched, fit_weight, _provenance(take, strength, rounds), shared, border)
+    return SmoothedTake(smoothed, take, others_matched, _provenance(take, rounds), border)
 
 
 def _results(
@@ -118,11 +110,12 @@ def _results(
             if hard is not None:
                 own[:] = on_null_space(own, hard(BodyState(take.roots[f], take.angles[f]))[1])
         tracked = [frames.results[f] for f in several]
-        if markers is not None and others is None and not len(take.channels.column):
+        if others is None and not len(take.pixels.points):
             part = markers.part(some)
             at = take.roots[some], take.angles[some]
+            states = [BodyState(root, q) for root, q in zip(*at)]
             made = frame_results(
-                body, *at, frames.times[some], covariance, part.evidence(body, part.gaps(body, *at)),
+                body, states, frames.times[some], covariance, part.evidence(body, part.gaps(body, *at)),
                 observed=take.observed[some], iterations=[r.iterations for r in tracked],
             )  # fmt: skip
         else:
@@ -143,11 +136,10 @@ def _result(
         scene = frames.tracker.scene_of(state, tracked.time)
     else:
         scene = take.others.scene(f, take.roots, take.angles)
-    pixels = take.pixels.matched(f, tracked.matched, scene)
-    markers = () if take.markers is None else take.markers.matched(f, scene)
-    matched = (*pixels, *markers, *(() if others is None else others[f]))
+    points = [m for block in take.blocks for m in block.matched(f, tracked.matched, scene)]
+    matched = (*points, *(() if others is None else others[f]))
     frame = frame_result(scene, covariance, matched, tracked.iterations, observed=take.observed[f])
-    return replace(frame, matched=pixels, measurements=())
+    return replace(frame, matched=tuple(pixels_of(points)), measurements=())
 
 
 def _closed(take: SmoothTake, hard: Constraint) -> SmoothTake:
@@ -178,23 +170,23 @@ def as_tracked(frames: TrackedFrames) -> SmoothTake:
     roots, angles = map(np.stack, zip(*((r.state.T_world_root, r.state.angles) for r in results)))
     all_observed = np.ones((len(roots), len(body.tree.coordinates)), bool)
     pixels = frames.packed_pixels(roots, angles)
-    markers, others = frames.packed_markers(), None
-    packed = () if markers is None else markers.sensors
+    markers, others, n = frames.packed_markers(), None, body.tree.n_dofs
+    packed = markers.sensors
     sensors = dict.fromkeys((m.sensor for r in results for m in r.measurements if m.sensor not in packed), 1.0)
     if sensors or body.closures:
-        rows = 2 * np.count_nonzero(pixels.channels.weight, axis=1)
-        rows += 0 if markers is None else 3 * np.count_nonzero(markers.stated, axis=1)
+        rows = 2 * np.count_nonzero(pixels.channels.weight, axis=1) + 3 * np.count_nonzero(markers.seen, axis=1)
         others = replace(frames, packed=packed, points=rows, scale=sensors)
+    acceleration = np.where(np.arange(n) < 3, settings.root_acceleration, settings.angle_acceleration)
     return SmoothTake(
-        body, pixels, roots, angles, all_observed, np.ones((len(roots), body.tree.n_dofs)), 1.0 / frames.tracker.rate,
-        (settings.acceleration_memory, settings.smooth_memory), markers=markers, others=others,
+        body, pixels, markers, roots, angles, all_observed, acceleration, np.ones((len(roots), n)),
+        1.0 / frames.tracker.rate, (settings.acceleration_memory, settings.smooth_memory), others=others,
     )  # fmt: skip
 
 
 def _take(take: SmoothTake, settings: TrackSettings) -> SmoothTake:
     """The take with continuous angles, lost frames filled, and its observed coordinates."""
     body, pixels, rate = take.body, take.pixels, 1.0 / take.dt
-    inliers = pixels.factors_at(body, take.roots, take.angles, pixels.channels.sigma) > MIN_INLIER_FACTOR
+    inliers = pixels.inliers(body, take.roots, take.angles)
     alone, rows = _observed(take)
     moves_keypoint = moves_points(body, pixels.points, inliers, take.roots, take.angles)
     observed = alone[0] & (moves_keypoint | looped(body)) | alone[1]
@@ -211,14 +203,10 @@ def _observed(take: SmoothTake) -> tuple[list[NDArray], NDArray]:
     out, rows = [np.zeros((T, D), bool), np.zeros((T, D), bool)], np.zeros(T)
     for some in stretches(T, MATRIX_FRAMES):
         part = take.part(some)
-        points = part.solver_points(take.channels.sigma)
-        kinds = [points]
-        if take.markers is not None or take.others is not None:
-            kinds.append(replace(points, weight=np.zeros_like(points.weight)))
+        points = part.solver_points()
+        kinds = [points, replace(points, weight=np.zeros_like(points.weight))]
         found = [unpacked(of.equations(take.body)(part.roots, part.angles)[0], tree) for of in kinds]
-        if part.markers is not None:
-            gaps = part.markers.gaps(part.body, part.roots, part.angles)
-            rows[some] += 3 * np.count_nonzero(part.markers.factors(gaps) > MIN_INLIER_FACTOR, axis=1)
+        rows[some] = 3 * np.count_nonzero(part.markers.inliers(part.body, part.roots, part.angles), axis=1)
         if take.others is not None:
             linear = take.others.linearised(take.roots, take.angles, frames=range(some.start, some.stop))
             found, rows[some] = [H + linear.H for H in found], rows[some] + linear.rows
@@ -230,49 +218,41 @@ def _observed(take: SmoothTake) -> tuple[list[NDArray], NDArray]:
 
 def _estimate(
     take: SmoothTake, settings: TrackSettings, window: int, overlap: int
-) -> tuple[Strength, SmoothTake, int]:
-    """Estimate the strength from a few parts of the take; returns it, the take with its liveliness, and the rounds."""
+) -> tuple[SmoothTake, int]:
+    """Estimate the noise from a few parts of the take; returns the take with it and its liveliness, and the rounds."""
     windows = [whole for whole, _ in parts(len(take.roots), window, overlap)]
     chosen = np.unique(np.linspace(0, len(windows) - 1, _NOISE_PARTS).round().astype(int))
-    start = settings.root_acceleration, settings.angle_acceleration
-    strength, pieces, rounds = estimate([take.part(windows[i]) for i in chosen], start, settings.smooth_rounds)
-    done = dict(zip(chosen.tolist(), pieces, strict=True))
-    take = take.scaled(pieces[0].scale)
+    pieces, rounds = estimate([take.part(windows[i]) for i in chosen], settings.smooth_rounds)
+    done, noise = dict(zip(chosen.tolist(), pieces, strict=True)), pieces[0].pixels
+    pixels = take.pixels.with_noise(noise.sigma, noise.errors.share)
+    take = replace(take, acceleration=pieces[0].acceleration, pixels=pixels).scaled(pieces[0].scale)
     roots, angles, live = np.array(take.roots), np.array(take.angles), np.array(take.live)
     left = (take.part(whole) for i, whole in enumerate(windows) if i not in done)
-    lively = partial(estimate_liveliness, strength=strength)
-    found = map(lively, left) if take.others is not None else side_by_side(lively, left)
+    found = map(estimate_liveliness, left) if take.others is not None else side_by_side(estimate_liveliness, left)
     for i, (whole, kept) in enumerate(parts(len(take.roots), window, overlap)):
         piece = done[i] if i in done else next(found)
         take.pixels.release()
         inside = slice(kept.start - whole.start, kept.stop - whole.start)
         roots[kept], angles[kept], live[kept] = piece.roots[inside], piece.angles[inside], piece.live[inside]
-    return strength, replace(take, roots=roots, angles=angles, live=live), rounds
+    return replace(take, roots=roots, angles=angles, live=live), rounds
 
 
-def _provenance(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, Any]:
-    coordinates = ("root_shift", "root_turn", *take.body.tree.coordinates)
-    values = [strength.acceleration[0], *strength.acceleration[5:]]
-    sigma = {
-        label: {
-            take.pixels.points.names[i]: round(float(strength.sigma[i]), 2)
-            for i in np.flatnonzero(take.channels.source == q)
-        }
-        for q, label in enumerate(take.channels.sources)
-    }
+def _provenance(take: SmoothTake, rounds: int) -> dict[str, Any]:
+    coordinates, pixels = ("root_shift", "root_turn", *take.body.tree.coordinates), take.pixels
+    values, points, share = [take.acceleration[0], *take.acceleration[5:]], pixels.points, pixels.errors.share
+    of_source = {q: np.flatnonzero(pixels.channels.source == k) for k, q in enumerate(pixels.channels.sources)}
     speeds = {} if take.speed_std is None else dict(zip(take.body.dof_names, take.speed_std.round(4).tolist()))
     return {
         "acceleration": {name: float(f"{v:.4g}") for name, v in zip(coordinates, values, strict=True)},
         "acceleration_memory": take.memory[0],
         "velocity_memory": take.memory[1],
         "speed_std": speeds,
-        "pixel_sigma": sigma,
+        "pixel_sigma": {
+            label: {points.names[i]: round(float(pixels.sigma[i]), 2) for i in own} for label, own in of_source.items()
+        },
         "shared_errors": {
-            label: {
-                take.body.tree.segments[take.pixels.points.segments[i]]: round(float(strength.shared[i]), 2)
-                for i in np.flatnonzero((take.channels.source == q) & (strength.shared > 0))
-            }
-            for q, label in enumerate(take.channels.sources)
+            label: {take.body.tree.segments[points.segments[i]]: round(float(share[i]), 2) for i in own if share[i] > 0}
+            for label, own in of_source.items()
         },
         "sigma_factor": {name: round(v, 2) for name, v in take.scale.items()},
         "liveliest": round(float(take.live.max()), 2),

@@ -22,12 +22,11 @@ from kinefit.frame.trust import segments_not_shown
 from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.points.keypoints import pixels_of
-from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.packed_pixels import PackedPixels
+from kinefit.smoothing.packed import PackedMarkers, PackedPixels
 from kinefit.smoothing.spool import Spool
-from kinefit.solvers.equations import normal_equations
+from kinefit.solvers.equations import normal_equations, robust_factors
 from kinefit.solvers.trajectory import _kernels_smoothing
 from kinefit.solvers.trajectory.smoothing import Equations, MakeEquations
 
@@ -81,6 +80,14 @@ class Linearised:
     matched: Sequence[tuple[Matched, ...]]
     rows: NDArray
     unsupported: NDArray | None = None
+
+    def equations(self, roots: NDArray, angles: NDArray) -> Equations:
+        """Equations at other states (T, 4, 4), (T, D), dense."""
+        delta = np.empty(self.g.shape)
+        _kernels_smoothing.differences(self.roots, roots, self.angles, angles, delta)
+        moved = np.einsum("tij,tj->ti", self.H, delta)
+        cost = self.cost - 2.0 * np.einsum("ti,ti->t", self.g, delta) + np.einsum("ti,ti->t", moved, delta)
+        return np.array(self.H), self.g - moved, cost
 
     def part(self, frames: slice) -> Linearised:
         """The costs of some frames."""
@@ -212,13 +219,12 @@ class TrackedFrames:
         found = PackedPixels.of(matches, rig, len(self.results), self.tracker.settings.loss)
         return found.swapped_as(found.swapped, self.tracker.body, roots, angles)
 
-    def packed_markers(self) -> PackedMarkers | None:
+    def packed_markers(self) -> PackedMarkers:
         """Labelled markers of all frames as one block; joints that move with morphs need rows instead."""
-        if self.markers is not None or not len(self.results):
+        if self.markers is not None:
             return self.markers
-        if self.tracker.scene_of(self.results[0].state, 0.0).morphing is not None:
-            return None
-        measured = (r.measurements for r in self.results)
+        morphing = self.tracker.scene_of(self.results[0].state, 0.0).morphing is not None
+        measured = (() if morphing else r.measurements for r in self.results)
         return PackedMarkers.of(self.tracker.body, measured, self.times, self.tracker.settings.marker_loss)
 
 
@@ -228,14 +234,9 @@ def with_quadratic(body: Body, make: MakeEquations, more: Linearised) -> MakeEqu
 
     def both(roots: NDArray, angles: NDArray) -> Equations:
         packed, g, cost = make(roots, angles)
-        delta = np.empty(more.g.shape)
-        _kernels_smoothing.differences(more.roots, roots, more.angles, angles, delta)
-        moved = np.einsum("tij,tj->ti", more.H, delta)
-        C = np.array(more.H)
+        C, more_g, more_cost = more.equations(roots, angles)
         _kernels_smoothing.add_packed(packed, chain, depth, C)
-        g += more.g - moved
-        cost += more.cost - 2.0 * np.einsum("ti,ti->t", more.g, delta) + np.einsum("ti,ti->t", moved, delta)
-        return C, g, cost
+        return C, g + more_g, cost + more_cost
 
     return both
 
@@ -244,9 +245,4 @@ def squares_of(rows: AnyRows) -> tuple[NDArray, NDArray]:
     """Squared residuals (R,) of rows, in variances, and robust factors (R,); both empty for other kinds of rows."""
     if not isinstance(rows, Rows | DofRows):
         return np.zeros(0), np.zeros(0)
-    square = rows.weight * rows.residual**2
-    if rows.loss is None:
-        return square, np.ones(len(square))
-    data = np.zeros((8, len(square)))
-    data[6], data[7] = rows.residual, rows.weight
-    return square, rows.loss.of_rows(data, rows.group)[0]
+    return rows.weight * rows.residual**2, robust_factors(rows)[0]

@@ -80,9 +80,8 @@ class SystematicErrors:
 
 
 def with_systematic_errors(
-    results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray,
-    others: OtherNoise | None = None, answers: Sequence[Answers] = (), *,
-    cameras: CameraErrors | None = None, shared: SharedErrors | None = None, smoothed: bool = True,
+    results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray, others: OtherNoise,
+    answers: Sequence[Answers] = (), *, cameras: CameraErrors | None = None, smoothed: bool = True,
 ) -> tuple[Iterator[FrameResult], VarianceComponents, LastingErrors]:  # fmt: skip
     """Add systematic errors and the uncertainty of the shape to standard deviations.
 
@@ -98,18 +97,15 @@ def with_systematic_errors(
     answers : uncertainty of shapes that were fitted to several kinds of sensors
     cameras : standard deviations of the cameras' poses, if neither the subject nor the answers contain them; None for
         exact ones
-    shared : errors that points of one segment share, as the fit assumed them; None for none
     smoothed : whether the fit averages neighbouring frames
     """
-    body, channels, rate = subject.body, take.channels, 1.0 / take.dt
-    shared = shared or SharedErrors.none(len(channels.column))
+    body, channels, shared, rate = subject.body, take.pixels.channels, take.pixels.errors, 1.0 / take.dt
     layout = Layout(channels.with_points(body), body)
-    half, n = round(MOTION_CORRELATION_TIME * rate), body.tree.n_dofs
     sampled = _sampled(len(results))
     absorbed, count = np.zeros((2, len(channels.column)))
     for f in sampled:
         rows, J, pushed = pixel_columns(layout, results[f].state, weight[f], shared)
-        whole = gram(J, pushed) + (0.0 if others is None else others.pooled(f, half))
+        whole = gram(J, pushed) + others.pooled(f)
         used = rows.weight > 0.0
         leverage = leverages(J[used], pushed[used], covariance_alone(body, results[f].state, whole))
         absorbed += np.bincount(rows.group[used], leverage, len(absorbed))
@@ -119,27 +115,25 @@ def with_systematic_errors(
         absorbed = 1.0 - (1.0 - absorbed) * (1.0 - channels.view_followed)
     values = _residuals(take)
     noise = variance_components(
-        values, np.arange(len(values)) / rate, leverage=absorbed, window=2 * half + 1,
+        values, np.arange(len(values)) / rate, leverage=absorbed, window=2 * others.half + 1,
         pool=np.minimum(channels.column, channels.column[channels.partner]), group=channels.source,
     )  # fmt: skip
     del values
     priors = KeypointPriors.of(subject, channels, cameras)
-    nothing = np.zeros((n, n)), Pushes.none(n)
 
     def errors_at(f: int) -> SystematicErrors:
-        other_sensors = nothing if others is None else (others.pooled(f, half), others.pushes(f))
-        near = weight[max(f - half, 0) : f + half + 1]
+        near, of_others = weight[others.near(f)], (others.pooled(f), others.pushes(f))
         assumed = 1.0 / np.maximum(near.max(axis=0), 1e-12)
         return systematic_errors(
-            priors, layout, results[f].state, near.mean(axis=0), assumed, noise, shared, *other_sensors,
-            averaged=2 * half + 1 if smoothed else 0,
+            priors, layout, results[f].state, near.mean(axis=0), assumed, noise, shared, *of_others,
+            averaged=2 * others.half + 1 if smoothed else 0,
         )  # fmt: skip
 
     few = {f: errors_at(f) for f in sampled.tolist()}
     shapes = [answer(list(few), [errors.alone for errors in few.values()]) for answer in answers]
     parameters = [(len(priors.root), priors.parameters), *((s.factors.shape[2], s.parameters) for s in shapes)]
-    drift_times = [noise.drift_time] if others is None or np.any(noise.drift > 0.0) else []
-    drift_times += [] if others is None else others.drift_times
+    drift_times = [noise.drift_time] if not others.lasting or np.any(noise.drift > 0.0) else []
+    drift_times += others.drift_times
     kept = _KeyFrames.of(few, shapes, len(results), rate, min(drift_times, default=np.inf), parameters)
 
     def variances() -> Iterator[tuple[NDArray, ...]]:
@@ -335,18 +329,6 @@ def pixel_columns(
     whitened = columns(rows, layout.body, state)
     twice = shared.whitened(shared.whitened(whitened, own, rows.group), own, rows.group)
     return rows, whitened / np.where(root > 0.0, root, 1.0), root * twice
-
-
-def pixel_information(take: SmoothTake, weight: NDArray, shared: SharedErrors | None) -> Callable[[int], NDArray]:
-    """Function: frame -> information (n, n) of its keypoints, with weights (F, N) [1/px²]."""
-    layout = Layout(take.channels.with_points(take.body), take.body)
-    shared = shared or SharedErrors.none(weight.shape[1])
-
-    def information(f: int) -> NDArray:
-        _, J, pushed = pixel_columns(layout, BodyState(take.roots[f], take.angles[f]), weight[f], shared)
-        return gram(J, pushed)
-
-    return information
 
 
 def systematic_errors(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit._threads import side_by_side
 from kinefit.sensors.base import Matched
-from kinefit.smoothing.process_noise import SmoothTake, Strength
+from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.spool import Spool
 from kinefit.solvers.trajectory.smoothing import Posterior
 
@@ -35,19 +35,18 @@ def parts(frames: int, window: int, overlap: int) -> list[tuple[slice, slice]]:
 
 
 def solved(
-    take: SmoothTake, strength: Strength, window: int, overlap: int, tolerances: Sequence[float] = _PASS_TOLERANCES
+    take: SmoothTake, window: int, overlap: int, tolerances: Sequence[float] = _PASS_TOLERANCES
 ) -> tuple[SmoothTake, Spool[tuple[Matched, ...]] | None]:
     """Solve a take in windows; returns it at its minimum, and the matches of all sensors but the keypoints.
 
     Parameters
     ----------
-    strength : process noise and noise of keypoints
     window, overlap : numbers of frames
     tolerances : unitless, of each pass of matching and solving; without other sensors the last one alone is used
     """
     matched, windows = None, parts(len(take.roots), window, overlap)
     for tolerance in tolerances[-1:] if take.others is None else tolerances:
-        fit = partial(SmoothTake.solved, strength=strength, tolerance=tolerance)
+        fit = partial(SmoothTake.solved, tolerance=tolerance)
         roots, angles = np.array(take.roots), np.array(take.angles)
         matched = None if take.others is None else Spool[tuple[Matched, ...]]()
         fits = side_by_side(fit, linear_parts(take, windows, matched))
@@ -60,19 +59,19 @@ def solved(
 
 
 def solved_with_covariances(
-    take: SmoothTake, strength: Strength, window: int, overlap: int
+    take: SmoothTake, window: int, overlap: int
 ) -> tuple[SmoothTake, Spool[NDArray], Spool[tuple[Matched, ...]] | None]:
     """As `solved`, with covariances: the upper triangle (n (n + 1) / 2,) of each frame's (n, n).
 
     The returned take also has the standard deviations of speeds.
     """
     if take.others is not None:
-        take, _ = solved(take, strength, window, overlap, _PASS_TOLERANCES[:-1])
+        take, _ = solved(take, window, overlap, _PASS_TOLERANCES[:-1])
     packed, windows = np.triu_indices(take.body.tree.n_dofs), parts(len(take.roots), window, overlap)
     roots, angles = np.array(take.roots), np.array(take.angles)
     covariances, speeds = Spool[NDArray](), []
     matched = None if take.others is None else Spool[tuple[Matched, ...]]()
-    fits = side_by_side(lambda part: part.fit(strength), linear_parts(take, windows, matched, judge=True))
+    fits = side_by_side(SmoothTake.fit, linear_parts(take, windows, matched, judge=True))
     for whole, kept in windows:
         fit, post = next(fits)
         inside = slice(kept.start - whole.start, kept.stop - whole.start)

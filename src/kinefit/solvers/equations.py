@@ -147,16 +147,14 @@ def residuals(rows: AnyRows) -> NDArray:
     return np.asarray(np.sqrt(rows.weight) * rows.residual)
 
 
-def softening(rows: AnyRows, loss: Loss) -> tuple[NDArray, float]:
-    """(N,) square roots of robust factors, and the cost Σ ρ (a number); `loss` is for rows without their own."""
+def robust_factors(rows: AnyRows, loss: Loss = SQUARED) -> tuple[NDArray, float]:
+    """(N,) robust factors, and the cost Σ ρ (a number); `loss` is for rows without their own."""
     if isinstance(rows, Rows):
-        factor, cost = (rows.loss or loss).of_rows(rows.data, rows.group)
-        return np.sqrt(factor), cost
+        return (rows.loss or loss).of_rows(rows.data, rows.group)
     if isinstance(rows, DofRows):
         data = np.zeros((8, len(rows)))
         data[6], data[7] = rows.residual, rows.weight
-        factor, cost = (rows.loss or loss).of_rows(data, rows.group)
-        return np.sqrt(factor), cost
+        return (rows.loss or loss).of_rows(data, rows.group)
     r = residuals(rows)
     return np.ones(len(rows)), float(r @ r)
 
@@ -172,8 +170,8 @@ def columns(rows: AnyRows, body: Body, state: BodyState) -> NDArray:
 def _add_dense(rows: DofRows, share: float, body: Body, loss: Loss, H: NDArray, g: NDArray) -> float:
     """Add rows on all degrees of freedom to H and g, multiplied by a share; returns their cost."""
     J = _jacobian(rows, body)
-    root, cost = softening(rows, loss)
-    weighted = J * (share * rows.weight * root**2)[:, None]
+    factor, cost = robust_factors(rows, loss)
+    weighted = J * (share * rows.weight * factor)[:, None]
     H += J.T @ weighted
     g += rows.residual @ weighted
     return share * float(cost)

@@ -93,7 +93,7 @@ class Descent(Generic[At]):
 def descend(
     at: At, solve: Callable[[At, float], tuple[Move, float]], follow: Callable[[At, Move], At | None], *,
     iterations: int, tolerance: float, damping: float, nothing: float = 1e-300,
-    least: float = _kernels_linear.LEAST_DAMPING, most: float = MAX_DAMPING,
+    least: float = _kernels_linear.LEAST_DAMPING, most: float = MAX_DAMPING, last: bool = False,
 ) -> Descent[At]:  # fmt: skip
     """Minimise a cost by damped Gauss-Newton steps, their damping adapted by Nielsen's rule.
 
@@ -105,6 +105,7 @@ def descend(
     iterations : number of steps tried, at most
     tolerance, nothing : stop when the predicted fall of the cost is below this share of it plus `nothing`
     damping, least, most : first λ, the least, and the λ at which the search ends, in the unit of `solve`
+    last : whether the step that ends it is taken, too
     """
     growth = 2.0
     for tried in range(1, iterations + 1):
@@ -112,14 +113,17 @@ def descend(
         if predicted < 0.0:
             damping, growth = _kernels_linear.adapt(damping, growth, -1.0, 1.0, least)
             continue
-        if predicted <= tolerance * at.cost + nothing:
+        converged = predicted <= tolerance * at.cost + nothing
+        if converged and not last:
             return Descent(at, tried, True, damping)
         new = follow(at, move)
         fall = -1.0 if new is None else at.cost - new.cost
         damping, growth = _kernels_linear.adapt(damping, growth, fall, predicted, least)
         if new is not None and fall > 0.0:
             at = new
-        elif damping > most:
+        else:
+            converged |= damping > most
+        if converged:
             return Descent(at, tried, True, damping)
     return Descent(at, iterations, False, damping)
 

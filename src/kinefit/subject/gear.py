@@ -114,18 +114,8 @@ _MAX_ABSORBED = 0.75  # share of all biases that parameters of the fit may absor
 _MIN_EXCESS = 1e-3  # reported for a sensor whose residuals are almost zero
 
 
-@dataclass(frozen=True, eq=False)
-class FrameRows:
-    """Rows of one measurement of a frame, at the fit.
-
-    Parameters
-    ----------
-    matched : the measurement's match, with sensor and channels
-    rows : its rows, of any kind
-    """
-
-    matched: Matched
-    rows: Sequence[AnyRows]
+FrameRows = tuple[Matched, Sequence[AnyRows]]
+"""A match, with sensor and channels, and its rows at the fit."""
 
 
 def excess(frames: Sequence[Sequence[FrameRows]], followed: float) -> dict[str, float]:
@@ -143,10 +133,10 @@ def excess(frames: Sequence[Sequence[FrameRows]], followed: float) -> dict[str, 
     """
     collected, of_points = ChannelResiduals(), dict[str, bool]()
     for f, measured in enumerate(frames):
-        for m in measured:
-            used = [r.weight > 0.0 if r.weight.ndim == 1 else np.ones(len(r), bool) for r in m.rows]
-            collected.add(f, m.matched, m.rows, [residuals(r) for r in m.rows], [w.astype(float) for w in used])
-            of_points[m.matched.sensor] = m.matched.of_points
+        for m, rows in measured:
+            used = [r.weight > 0.0 if r.weight.ndim == 1 else np.ones(len(r), bool) for r in rows]
+            collected.add(f, m, rows, [residuals(r) for r in rows], [w.astype(float) for w in used])
+            of_points[m.sensor] = m.of_points
     found = {s: both for s, both in collected.arrays(len(frames)).items() if both[1].sum() >= _MIN_RESIDUALS}
     looks = {
         s: float(count.any(axis=0).sum() if of_points[s] else count.sum() / len(frames))

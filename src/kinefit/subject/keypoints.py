@@ -179,10 +179,10 @@ def _without_bias(
     body: Body, channels: Channels, found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]
 ) -> tuple[ViewBias, list[Sequence[KeypointMeasurement]]]:
     """Estimate the detectors' bias by view from fitted frames; returns it, and the frames with it removed."""
-    sized = Worlds(found.prior_world, found.parameters).at(found.mean).body
-    matched = [m.match(Scene(sized, state, channels.rig), joint.REACH[-1]) for (m,), state in zip(steps, found.states)]
+    scenes = [Scene(found.body, state, channels.rig) for state in found.states]
+    matched = [m.match(scene, joint.REACH[-1]) for (m,), scene in zip(steps, scenes)]
     uv, weight = (np.stack([getattr(m, name) for m in matched]) for name in ("uv", "weight"))
-    frames = SeenFrames(sized, channels, found.states, uv, weight * np.square(channels.sigma))
+    frames = SeenFrames(found.body, channels, found.states, uv, weight * np.square(channels.sigma))
     bias = learn_view_bias([frames])
     layout = Layout(bias.known_to(channels), body)
     return bias, [
@@ -198,9 +198,9 @@ def _by_detector(
 
     All detectors have one standard deviation by default. Without this the worse of two would weigh as much on lengths.
     """
-    sized = Worlds(found.prior_world, found.parameters).at(found.mean).body
-    matched = [m.match(Scene(sized, state, channels.rig), joint.REACH[-1]) for (m,), state in zip(steps, found.states)]
-    squares = np.stack([m.squares(Scene(sized, state, channels.rig)) for m, state in zip(matched, found.states)])
+    scenes = [Scene(found.body, state, channels.rig) for state in found.states]
+    matched = [m.match(scene, joint.REACH[-1]) for (m,), scene in zip(steps, scenes)]
+    squares = np.stack([m.squares(scene) for m, scene in zip(matched, scenes)])
     used = np.stack([m.weight > 0 for m in matched])
     spans = [(channels.column >= s.start) & (channels.column < s.stop) for s in channels.sets.values()]
     medians = np.array([np.median(squares[:, s][used[:, s]]) if used[:, s].any() else np.inf for s in spans])

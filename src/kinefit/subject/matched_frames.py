@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.geometry.camera import Rig
 from kinefit.rows import AnyRows, Rows
-from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
-from kinefit.sensors.points.keypoints import packed
+from kinefit.sensors.base import Matched, Measurement, matched_by, packed, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.bundle.border_frames import Part, apart
 from kinefit.solvers.pixels import PixelPoints
@@ -235,7 +234,7 @@ class MatchedFrames:
         world = self._worlds.at(theta)
         return [
             [
-                FrameRows(matched, self._rows((f, i), matched.sensor, matched, self._scene(world, f, state), world))
+                (matched, self._rows((f, i), matched.sensor, matched, self._scene(world, f, state), world))
                 for i, matched in enumerate(self._matched[f])
             ]
             for f, state in enumerate(states)

@@ -16,9 +16,9 @@ from kinefit.findings import runs_of
 from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult, frame_results
 from kinefit.markers.poses import sequence_both_ways
 from kinefit.sensors.base import Measurement
-from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.sensor_noise import covariance_alone, marker_matrices
+from kinefit.smoothing.packed import PackedMarkers
+from kinefit.smoothing.sensor_noise import covariance_alone
 from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.subject import Progress
@@ -52,10 +52,10 @@ def fit_marker_steps(
         sensors.update(m.sensor for m in out)
         return out
 
-    markers = None
-    if scene.morphing is None:
-        markers = PackedMarkers.of(body, _OnDemand(len(times), measured), times, settings.marker_loss)
-    if markers is None or sensors - set(markers.sensors):
+    if scene.morphing is not None:
+        return None
+    markers = PackedMarkers.of(body, _OnDemand(len(times), measured), times, settings.marker_loss)
+    if not markers.sensors or sensors - set(markers.sensors):
         return None
     roots, angles = room((len(times), 4, 4)), room((len(times), len(body.tree.coordinates)))
     last: BodyState | None = None
@@ -66,7 +66,8 @@ def fit_marker_steps(
         except TrackingError:
             return None
         last = BodyState(roots[some][-1], angles[some][-1])
-        release(markers.places, markers.stated, roots, angles)
+        markers.release()
+        release(roots, angles)
         if progress:
             progress("frames", some.stop, len(times))
     angles[:] = unwrap(body.tree, angles)
@@ -107,11 +108,11 @@ def _judged(body: Body, markers: PackedMarkers, roots: NDArray, angles: NDArray)
     out = Spool[FrameResult]()
     for some in stretches(len(roots), MATRIX_FRAMES):
         part, at = markers.part(some), (roots[some], angles[some])
-        states = (BodyState(root, q) for root, q in zip(*at))
-        covariances = np.stack([covariance_alone(body, *s) for s in zip(states, marker_matrices(body, part, *at))])
+        states = [BodyState(root, q) for root, q in zip(*at)]
+        covariances = np.stack([covariance_alone(body, *s) for s in zip(states, part.information(body, *at))])
         observed = np.sqrt(np.einsum("fii->fi", covariances))[:, 6:] <= UNOBSERVED_STD_RATIO * body.tree.spread
         for result in frame_results(
-            body, *at, part.times, covariances, part.evidence(body, part.gaps(body, *at)), observed=observed,
+            body, states, part.times, covariances, part.evidence(body, part.gaps(body, *at)), observed=observed,
             iterations=[0] * len(covariances),
         ):
             out.append(result)

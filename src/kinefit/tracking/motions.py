@@ -29,7 +29,6 @@ from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.smoothing.uncertainty import (
     MOTION_CORRELATION_TIME,
     asked_frames,
-    pixel_information,
     with_systematic_errors,
 )
 from kinefit.smoothing.unwrap import unwrap
@@ -78,7 +77,6 @@ def motion_of(
     body, settings, rate = tracker.body, tracker.settings, tracker.rate
     smooth, lag, eye = how.smooth, how.lag, how.eye
     provenance: dict[str, Any] = dict(more or {})
-    shared = None
     matched: Sequence[tuple[Matched, ...]] | None = None  # of all sensors but keypoints and packed markers
     if smooth:
         held = how.contacts or eye is not None or not how.level
@@ -86,7 +84,7 @@ def motion_of(
         done = smooth_results(
             frames, contacts=held, up=up, eye=eye, level=how.level, border=border
         )
-        results, take, weight, shared = done.results, done.take, done.weight, done.shared
+        results, take = done.results, done.take
         provenance["smoothing"] = done.provenance
         matched = done.matched
         if done.border is not None:
@@ -96,12 +94,11 @@ def motion_of(
         if lag is not None:
             results, matched, provenance["fixed lag"] = _behind(frames, lag, how.noise)
         take = as_tracked(replace(frames, results=results))
-        weight = take.pixels.weights(body, take.roots, take.angles, take.channels.sigma)
         if take.others is not None and lag is None:
             of = take.others
             matched = Spool(of.matched(of.scene(f, take.roots, take.angles)) for f in range(len(results)))
-    others, channels, markers = take.others, take.channels, take.markers
-    packed = set(() if markers is None else markers.sensors)
+    others, channels, markers = take.others, take.pixels.channels, take.markers
+    packed, weight = set(markers.sensors), take.pixels.weights(body, take.roots, take.angles)
     if lag is not None and packed and matched is not None:
         matched = Spool(tuple(m for m in several if m.sensor not in packed) for several in matched)
 
@@ -114,11 +111,11 @@ def motion_of(
     def with_markers(f: int) -> tuple[Scene, list[Matched]]:
         """The same, with packed markers."""
         scene, several = seen(f)
-        return scene, several + list(() if markers is None else markers.matched(f, scene))
+        return scene, [*several, *markers.matched(f, (), scene)]
 
     provenance["contradictions"] = contradictions(*zip(*(with_markers(int(f)) for f in spread(len(results), LOOKS))))
-    residuals = {} if markers is None else markers.residuals(body, take.roots, take.angles)
-    if markers is None or channels.sources or (others is not None and others.scale):
+    residuals = markers.residuals(body, take.roots, take.angles)
+    if not packed or channels.sources or (others is not None and others.scale):
         again = seen if smooth or lag is not None else None
         residuals = _residuals(frames.results, again, packed) | residuals
     take.pixels.release()
@@ -127,10 +124,10 @@ def motion_of(
     provenance["contradictions"] |= cameras_apart(residuals, stated)
     # the tracker's own frames hold the surfaces' errors already
     noise_of_others = noise_of_sensors(
-        take, matched, pixel_information(take, weight, shared), half=round(MOTION_CORRELATION_TIME * rate),
-        surfaces=smooth or lag is not None, frames=asked_frames(len(results), rate),
+        take, matched, half=round(MOTION_CORRELATION_TIME * rate), surfaces=smooth or lag is not None,
+        frames=asked_frames(len(results), rate),
     )  # fmt: skip
-    if noise_of_others is not None:
+    if take.others is not None or packed:
         provenance["sensor noise"] = noise_of_others.summary()
 
     def weighed(f: int) -> tuple[Scene, list[Matched]]:
@@ -146,7 +143,7 @@ def motion_of(
     elsewhere = any(one.cameras is not None for one in found)
     last, detectors, lasting = with_systematic_errors(
         results, subject, take, weight, noise_of_others, answers,
-        cameras=None if elsewhere else settings.camera_errors, shared=shared, smoothed=smooth,
+        cameras=None if elsewhere else settings.camera_errors, smoothed=smooth,
     )  # fmt: skip
     if channels.sources:
         provenance["detector noise"] = detectors.summary("px", 2, channels.sources)

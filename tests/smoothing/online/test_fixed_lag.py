@@ -14,7 +14,6 @@ from kinefit.bodies.tree import twin
 from kinefit.errors import ObservationError
 from kinefit.smoothing.online.fixed_lag import FixedLag
 from kinefit.smoothing.online.lag_frame import KnownNoise
-from kinefit.smoothing.process_noise import Strength
 from kinefit.smoothing.smoother import as_tracked
 from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.smoothing.unwrap import continued, unwrap
@@ -58,11 +57,10 @@ def whole(tracker, results, noise):
     kept = [r.kept(tracker.scene_of(r.state, r.time)) for r in results]
     times = np.array([r.time for r in results])
     take = as_tracked(TrackedFrames(kept, times, tracker))
-    channels = take.channels
-    take = replace(take, angles=unwrap(BODY.tree, take.angles))
+    take = replace(take, angles=unwrap(BODY.tree, take.angles), acceleration=noise.acceleration)
     for _ in range(3):
         take = take.renewed()
-        fit, post = take.fit(Strength(noise.acceleration, np.array(channels.sigma), np.zeros(len(channels.sigma))))
+        fit, post = take.fit()
         take = replace(take, roots=fit.roots, angles=fit.angles)
     return [BodyState(T, q) for T, q in zip(fit.roots, fit.angles, strict=True)], post
 

@@ -20,7 +20,7 @@ from kinefit.observations import KEYPOINTS, KeypointFrame, Keypoints
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.channels import Channels, known_points, make_channels
-from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence
+from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence, moves_points
 from kinefit.sensors.points.views import (
     HandViews,
     ViewBias,
@@ -58,7 +58,7 @@ class Layout:
     @cached_property
     def points(self) -> PointSet:
         """A point of the body for every channel (N,)."""
-        return self._of(self.channels)
+        return self.channels.each
 
     @cached_property
     def groups(self) -> NDArray:
@@ -100,7 +100,7 @@ class Layout:
         if body is self.body:
             return self.points
         if self._latest.get("body") is not body:
-            self._latest.update(body=body, points=self._of(self.channels.with_points(body)))
+            self._latest.update(body=body, points=self.channels.with_points(body).each)
         return self._latest["points"]
 
     @cached_property
@@ -123,14 +123,6 @@ class Layout:
     def names(self) -> tuple[str, ...]:
         """(N,) source and point of every channel."""
         return tuple(f"{self.channels.sources[q]} {name}" for q, name in zip(self.channels.source, self.points.names))
-
-    @staticmethod
-    def _of(channels: Channels) -> PointSet:
-        if not len(channels.column):
-            return channels.points
-        names = tuple(channels.points.names[c] for c in channels.column)
-        owner, place = channels.points.segments, channels.points.points
-        return PointSet(names, owner[channels.column], place[channels.column])
 
 
 def projected(scene: Scene, layout: Layout) -> NDArray:
@@ -341,6 +333,12 @@ class KeypointMatched(Matched):
             return None
         return PixelPoints(layout.points_of(body), layout.channels.camera, self.uv, self.weight, self.loss)
 
+    def moves(self, scene: Scene) -> NDArray:
+        """(D,) bool: coordinates that move a keypoint whose detection agrees with the fit."""
+        inside = (self.weight > 0) & (self.squares(scene.at_time(self.time)) < AGREEMENT_SIGMAS**2)
+        points, state = self.measurement.layout.points_of(scene.body), scene.state
+        return moves_points(scene.body, points, inside[None], state.T_world_root[None], state.angles[None])[0]
+
     def squares(self, scene: Scene) -> NDArray:
         """(N,) squared distances in the image, in variances; 0 where unseen, inf where it could not be seen."""
         gap = self.uv - projected(scene, self.measurement.layout)
@@ -412,12 +410,6 @@ class KeypointMatched(Matched):
 def keypoint_sigma(keypoints: Sequence[Keypoints], sigma: Mapping[str, float], default: float) -> list[float]:
     """[px] of each record, where {camera: standard deviation} or {"CAMERA SET": standard deviation} are given."""
     return [sigma.get(f"{k.camera} {k.keypoint_set}", sigma.get(k.camera, default)) for k in keypoints]
-
-
-def packed(matched: Sequence[Matched], scene: Scene) -> PixelPoints | None:
-    """The points of a scene's only match for a fit in one compiled piece; None where rows are needed."""
-    one = next(iter(pixels_of(matched)), None) if len(matched) == 1 else None
-    return None if one is None or scene.at_time(one.time) is not scene else one.packed(scene)
 
 
 def pixels_of(matched: Iterable[Matched]) -> list[KeypointMatched]:

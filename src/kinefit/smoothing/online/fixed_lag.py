@@ -20,14 +20,13 @@ from kinefit.frame.results import FrameResult, frame_result
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Measurement, of_kind
 from kinefit.smoothing.online.lag_frame import FrameCosts, KnownNoise, LagFrame
-from kinefit.smoothing.tracked_frames import TrackerLike
+from kinefit.smoothing.tracked_frames import Linearised, TrackerLike
 from kinefit.smoothing.unwrap import boxes, continued
 from kinefit.solvers.closed import on_null_space, onto
 from kinefit.solvers.equations import block_diagonal
-from kinefit.solvers.trajectory import _kernels_smoothing
 from kinefit.solvers.trajectory.marginal import Entering, leave
 from kinefit.solvers.trajectory.motion_prior import MotionPrior
-from kinefit.solvers.trajectory.smoothing import Equations, Smoothed, posterior, smooth
+from kinefit.solvers.trajectory.smoothing import Smoothed, posterior, smooth
 
 _OLDER_FRAMES_S = 0.3  # [s] of frames before the lag that are still linearised
 _MAX_ITERATIONS = 3  # of a window: it starts at the solution of the last one
@@ -180,19 +179,12 @@ class FixedLag:
         made = [self._costs.quadratic(self._frames, f) for f in range(len(frames))]
         H, g, cost = (np.array(v) for v in zip(*made))
         roots, angles = self._states()
+        costs = Linearised(H, g, cost, roots, angles, (), np.zeros(len(cost)))
         lower, upper, mean = boxes(tree, angles)
         prior = replace(self._prior, mean=mean, liveliness=self._livelier)
-
-        def equations(new_roots: NDArray, new_angles: NDArray) -> Equations:
-            delta = np.empty(g.shape)
-            _kernels_smoothing.differences(roots, new_roots, angles, new_angles, delta)
-            moved = np.einsum("tij,tj->ti", H, delta)
-            costs = cost - 2.0 * np.einsum("ti,ti->t", g, delta) + np.einsum("ti,ti->t", moved, delta)
-            return np.array(H), g - moved, costs
-
         self._last: Smoothed = smooth(
-            self.body, roots, angles, equations, prior, bounds=(lower, upper), dense=True, entering=self._entering,
-            max_iterations=_MAX_ITERATIONS, tolerance=1e-4,
+            self.body, roots, angles, costs.equations, prior, bounds=(lower, upper), dense=True,
+            entering=self._entering, max_iterations=_MAX_ITERATIONS, tolerance=1e-4,
         )  # fmt: skip
         for frame, T, q in zip(frames, self._last.roots, self._last.angles):
             frame.state = BodyState(T, q)

@@ -17,10 +17,8 @@ from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.evidence import moves_points
 from kinefit.sensors.points.keypoints import KeypointMatched, pixels_of
 from kinefit.sensors.scene import Scene
-from kinefit.smoothing.process_noise import MIN_INLIER_FACTOR
 from kinefit.smoothing.tracked_frames import TrackerLike
 from kinefit.solvers.equations import inverse, normal_equations
 
@@ -71,28 +69,20 @@ class FrameCosts:
     def observed(self, frames: Sequence[LagFrame], f: int) -> NDArray:
         """(D,) bool: coordinates that a frame observes on its own."""
         frame, scene, tree = frames[f], self.scene(frames, f), self.body.tree
-        pixels = pixels_of(frame.points)
-        others = [m for m in (*frame.points, *frame.surfaces) if not isinstance(m, KeypointMatched)]
+        moved = [(m, m.moves(scene)) for m in (*frame.points, *frame.surfaces)]
+        moving = [of_points for _, of_points in moved if of_points is not None]
         observed = np.zeros(len(tree.coordinates), bool)
         H = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
         closed = every_closure(self.body, scene.state)
         if closed:
             H = H + normal_equations(self.body, scene.state, closed).matrix
-        for matched, of_keypoints in ((others, False), (pixels, True)):
+        for in_images in (False, True):
+            matched = [m for m, of_points in moved if (of_points is not None) == in_images]
             if matched:
                 H = H + normal_equations(self.body, scene.state, self._rows(matched, scene, frame.points)).matrix
                 new = np.sqrt(np.maximum(np.diag(inverse(H)), 0.0))[6:] <= UNOBSERVED_STD_RATIO * tree.spread
-                observed |= new & (self._moves_keypoints(pixels, scene) | looped(self.body)) if of_keypoints else new
+                observed |= new & (np.any(moving, axis=0) | looped(self.body)) if in_images else new
         return observed
-
-    def _moves_keypoints(self, pixels: Sequence[KeypointMatched], scene: Scene) -> NDArray:
-        """(D,) bool: coordinates that move a keypoint whose detection is an inlier."""
-        out = np.zeros(len(self.body.tree.coordinates), bool)
-        for m in pixels:
-            inside = (m.weight > 0) & (m.loss.factor(m.squares(scene)) > MIN_INLIER_FACTOR)
-            points, state = m.measurement.layout.points_of(self.body), scene.state
-            out |= moves_points(self.body, points, inside[None], state.T_world_root[None], state.angles[None])[0]
-        return out
 
     def scene(self, frames: Sequence[LagFrame], f: int) -> Scene:
         """The scene of a frame of the window, with its velocity there."""

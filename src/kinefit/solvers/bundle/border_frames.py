@@ -16,7 +16,7 @@ from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows, Rows
 from kinefit.solvers import _kernels_border, _kernels_linear
 from kinefit.solvers.bundle.arrow import MIN_DIAGONAL_RATIO
-from kinefit.solvers.equations import columns, dense_pattern, lock, normal_equations, residuals, softening
+from kinefit.solvers.equations import columns, dense_pattern, lock, normal_equations, residuals, robust_factors
 from kinefit.solvers.least_squares import bounds_of, descend
 from kinefit.solvers.pixels import fit_pixels
 
@@ -101,7 +101,9 @@ class FrameEquations:
     def factor(self) -> NDArray:
         """(N,) square root of the rows' shares times robust factors."""
         w = self.weighing
-        own = [np.sqrt(w.shares.get(sensor, 1.0)) * softening(rows, w.loss)[0] for sensor, rows in self.parts]
+        own = [
+            np.sqrt(w.shares.get(sensor, 1.0)) * np.sqrt(robust_factors(rows, w.loss)[0]) for sensor, rows in self.parts
+        ]
         return np.concatenate([np.empty(0), *own])
 
     @cached_property

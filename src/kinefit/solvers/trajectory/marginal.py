@@ -47,10 +47,16 @@ class Entering:
         return float(delta @ pull - 2.0 * self.g @ delta)
 
 
+def padded(n: int) -> int:
+    """Size of the blocks in which `factor_band` has n unknowns (int): a multiple of four."""
+    return 4 * -(-n // 4)
+
+
 def start_of(
-    entering: Entering | None, n: int, p: int, held: NDArray | None = None, *, covariance: bool = False
+    entering: Entering | None, n: int, held: NDArray | None = None, *, covariance: bool = False
 ) -> NDArray:
     """H (3 p, 3 p) for `factor_band`, with n of p unknowns in each frame, without `held` (3, n) bool."""
+    p = padded(n)
     out = np.zeros((3, p, 3, p))
     if entering is not None:
         H = np.array(entering.H_covariance if covariance else entering.H)
@@ -125,7 +131,7 @@ def _unpacked(band: NDArray, first: NDArray, width: NDArray) -> NDArray:
 
 def _schur(A: NDArray, b: NDArray, n: int) -> tuple[NDArray, NDArray]:
     """Schur complement of A (4 n, 4 n), b (4 n,) without the first n unknowns: (3 n, 3 n), (3 n,)."""
-    p = 4 * -(-n // 4)
+    p = padded(n)
     alone = np.zeros((p, p))
     alone[:n, :n] = inverse(A[:n, :n] + 1e-12 * np.trace(A) / len(A) * np.eye(n))
     below, fall, removed = np.zeros((3 * p, p)), np.empty((3 * p, p)), np.empty((3 * p, 3 * n))

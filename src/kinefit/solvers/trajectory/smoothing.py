@@ -10,17 +10,18 @@ Cholesky factor; covariances are blocks of its inverse (Takahashi et al. 1973).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, KinematicTree
 from kinefit.errors import ObservationError
-from kinefit.solvers._kernels_linear import LEAST_DAMPING, adapt
+from kinefit.solvers._kernels_linear import LEAST_DAMPING
 from kinefit.solvers.equations import dense_pattern
+from kinefit.solvers.least_squares import descend
 from kinefit.solvers.trajectory import _kernels_band, _kernels_smoothing
-from kinefit.solvers.trajectory.marginal import Entering, blocks, start_of
+from kinefit.solvers.trajectory.marginal import Entering, blocks, padded, start_of
 from kinefit.solvers.trajectory.motion_prior import MotionPrior
 
 _MAX_DAMPING = 1e12  # over the mean diagonal: with more the cost cannot fall
@@ -79,13 +80,11 @@ class Posterior:
     frames : (T, n, n) covariance of every frame
     following : (T - 1, n, n) cross-covariance of frame t + 1 (rows) and frame t (columns)
     change_variance : (T - 1, n) of every r_s
-    log_determinant : float, of the system's matrix
     """
 
     frames: NDArray
     following: NDArray
     change_variance: NDArray
-    log_determinant: float
 
 
 def smooth(
@@ -121,47 +120,40 @@ def smooth(
     ObservationError
         The equations are not finite.
     """
-    tree, first, width = body.tree, *blocks(body)
+    tree = body.tree
     if prior.coupled and not dense:
         equations, dense = _made_dense(body, equations), True
     chain, depth = pattern = dense_pattern(tree.n_dofs) if dense else (tree.chain, tree.depth)
     lower, upper = (np.array(np.broadcast_to(b, angles.shape), float) for b in bounds or (-np.inf, np.inf))
-    roots, angles = np.array(roots, float, order="C"), np.clip(np.array(angles, float, order="C"), lower, upper)
-    now = _system(body, roots, angles, equations, prior, depth, entering)
-    mean = float(now.C[:, np.arange(tree.n_dofs), depth].mean() + now.band[0, :, :, 0].mean())
-    if not np.isfinite(now.cost) or not np.isfinite(mean):
-        raise ObservationError("this take cannot be smoothed", remedy="Check that all weights and pixels are finite.")
-    damping, growth, nothing = 1e-9 * mean, 2.0, 1e-16 * now.cost + 1e-300
-    W, below, delta = _workspace(len(roots), tree.n_dofs)
-    start = start_of(entering, tree.n_dofs, W.shape[1])
-    fresh, converged, tried, any_held = True, False, 0, False
-    while tried < max_iterations and not converged:
-        if fresh:
-            held = _held(body, now, angles, lower, upper)
-            any_held = bool(held.any())
-            if any_held:
-                _kernels_smoothing.hold(held, first, width, chain, depth, now.C, now.band, now.g)
-            if entering is not None:
-                start = start_of(entering, tree.n_dofs, W.shape[1], held[:3])
-        tried, fresh = tried + 1, False
-        delta[:, : tree.n_dofs] = now.g
-        if not _kernels_band.factor_band(now.C, chain, depth, now.band, first, width, damping, start, W, below, delta):
-            damping, growth = 100.0 * damping, 2.0
-            continue
+    n, (W, below, delta) = tree.n_dofs, _workspace(len(roots), tree.n_dofs)
+
+    def at(roots: NDArray, angles: NDArray) -> Smoothed:
+        system = _system(body, roots, angles, equations, prior, depth, entering)
+        held = _held(body, system, angles, lower, upper)
+        return Smoothed(roots, angles, system.cost, 0, False, prior, system, pattern, held)
+
+    def solve(now: Smoothed, damping: float) -> tuple[NDArray, float]:
+        C, band, g, start = _within_limits(body, now)
+        delta[:, :n], step = g, delta[:, :n]
+        if not _kernels_band.factor_band(C, chain, depth, band, *blocks(body), damping, start, W, below, delta):
+            return step, -1.0
         _kernels_band.back_substitute(W, below, delta)
-        step = delta[:, : tree.n_dofs]
-        predicted = float(np.vdot(step, now.g) + damping * np.vdot(step, step))
-        converged = predicted <= tolerance * now.cost + nothing or damping > _MAX_DAMPING * mean
-        new_roots, new_angles = np.empty_like(roots), np.empty_like(angles)
-        _kernels_smoothing.retract_all(roots, angles, step, lower, upper, new_roots, new_angles)
-        new = _system(body, new_roots, new_angles, equations, prior, depth, entering)
-        damping, growth = adapt(damping, growth, now.cost - new.cost, predicted, LEAST_DAMPING * mean)
-        if new.cost < now.cost:
-            fresh, now, roots, angles = True, new, new_roots, new_angles
-    if any_held and not fresh:
-        now = _system(body, roots, angles, equations, prior, depth, entering)  # without held angles' modifications
-    held = _held(body, now, angles, lower, upper)
-    return Smoothed(roots, angles, now.cost, tried, converged, prior, now, pattern, held)
+        return step, float(np.vdot(step, g) + damping * np.vdot(step, step))
+
+    def follow(now: Smoothed, step: NDArray) -> Smoothed:
+        roots, angles = np.empty_like(now.roots), np.empty_like(now.angles)
+        _kernels_smoothing.retract_all(now.roots, now.angles, step, lower, upper, roots, angles)
+        return at(roots, angles)
+
+    start = at(np.array(roots, float, order="C"), np.clip(np.array(angles, float, order="C"), lower, upper))
+    mean = float(start.system.C[:, np.arange(n), depth].mean() + start.system.band[0, :, :, 0].mean())
+    if not np.isfinite(start.cost) or not np.isfinite(mean):
+        raise ObservationError("this take cannot be smoothed", remedy="Check that all weights and pixels are finite.")
+    end = descend(
+        start, solve, follow, iterations=max_iterations, tolerance=tolerance, nothing=1e-16 * start.cost + 1e-300,
+        damping=1e-9 * mean, least=LEAST_DAMPING * mean, most=_MAX_DAMPING * mean, last=True,
+    )  # fmt: skip
+    return replace(end.at, iterations=end.iterations, converged=end.converged)
 
 
 def _held(body: Body, at: _BandEquations, angles: NDArray, lower: NDArray, upper: NDArray) -> NDArray:
@@ -171,18 +163,27 @@ def _held(body: Body, at: _BandEquations, angles: NDArray, lower: NDArray, upper
     return np.concatenate([np.full((len(g), 6), not body.tree.root_free), moving], axis=1)
 
 
+def _within_limits(body: Body, at: Smoothed) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """C, band and g of the system without the degrees of freedom held, and the start for `factor_band`."""
+    s = at.system
+    start = start_of(s.entering, at.held.shape[1], at.held[:3])
+    if not at.held.any():
+        return s.C, s.band, s.g, start
+    C, band, g = s.C.copy(), s.band.copy(), s.g.copy()
+    _kernels_smoothing.hold(at.held, *blocks(body), *at.pattern, C, band, g)
+    return C, band, g, start
+
+
 def responses(body: Body, smoothed: Smoothed, B: NDArray) -> NDArray:
     """A⁻¹ B (T, n, p) for the system A of a smoothed take and B (T, n, p); 0 where limits hold."""
-    s, (chain, depth), n = smoothed.system, smoothed.pattern, B.shape[1]
-    C, band, (first, width), out = s.C.copy(), s.band.copy(), blocks(body), np.array(B)
+    (C, band, _, start), (chain, depth) = _within_limits(body, smoothed), smoothed.pattern
+    n, out = B.shape[1], np.array(B)
     out[smoothed.held] = 0.0
-    _kernels_smoothing.hold(smoothed.held, first, width, chain, depth, C, band, s.g.copy())
     W, below, delta = _workspace(len(B), n)
-    start = start_of(s.entering, n, W.shape[1], smoothed.held[:3])
     tiny = 1e-12 * float(C[:, np.arange(n), depth].mean())
     for k in range(B.shape[2]):
         delta[:, :n] = out[..., k]
-        while not _kernels_band.factor_band(C, chain, depth, band, first, width, tiny, start, W, below, delta):
+        while not _kernels_band.factor_band(C, chain, depth, band, *blocks(body), tiny, start, W, below, delta):
             tiny, delta[:, :n] = 10.0 * tiny, out[..., k]
         _kernels_band.back_substitute(W, below, delta)
         out[..., k] = delta[:, :n]
@@ -211,7 +212,7 @@ def _lower(packed: NDArray, tree: KinematicTree) -> NDArray:
 
 
 def _workspace(T: int, n: int) -> tuple[NDArray, NDArray, NDArray]:
-    p = 4 * -(-n // 4)
+    p = padded(n)
     return np.empty((T, p, p)), np.empty((T, 3 * p, p)), np.zeros((T, p))
 
 
@@ -260,15 +261,15 @@ def posterior(body: Body, smoothed: Smoothed, since: int = 0, share: NDArray | N
     share = prior.posture_share if share is None else share
     _add_posture(C, share - prior.precision, depth)
     W, below, nothing = _workspace(T, n)
-    p, tiny = W.shape[1], max(1e-12 * float(s.C[:, np.arange(n), depth].mean()), 1e-12)  # nothing measured: C is 0
-    start = start_of(s.entering, n, p, covariance=True)
+    tiny = max(1e-12 * float(s.C[:, np.arange(n), depth].mean()), 1e-12)  # nothing measured: C is 0
+    start = start_of(s.entering, n, covariance=True)
     while not _kernels_band.factor_band(C, chain, depth, s.band, *blocks(body), tiny, start, W, below, nothing):
         tiny *= 10.0
     frames, following = np.full((T, n, n), np.nan), np.full((max(T - 1, 0), n, n), np.nan)
     past, _ = prior.rows(max(T - 1, 0))
     variance = np.zeros((max(T - 1, 0), n))
     _kernels_band.covariance_blocks(W, below, past, since, frames, following, variance)
-    return Posterior(frames, following, variance, -2.0 * float(np.log(np.einsum("tii->ti", W)[:, :n]).sum()))
+    return Posterior(frames, following, variance)
 
 
 def _add_posture(C: NDArray, weight: NDArray, depth: NDArray) -> None:

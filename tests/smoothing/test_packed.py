@@ -1,4 +1,4 @@
-"""Labelled markers as one block of a take are the markers of its frames."""
+"""Packed points of a take are the points of its frames."""
 
 from dataclasses import replace
 
@@ -8,8 +8,8 @@ from tests.tracking.movements import BODY, a_motion, a_rig, marker_frame
 from kinefit.losses import SQUARED, geman_mcclure
 from kinefit.sensors.base import leftovers_at, matched_by
 from kinefit.sensors.points.markers import MarkerSensor
-from kinefit.sensors.points.packed_markers import PackedMarkers
 from kinefit.sensors.scene import Scene
+from kinefit.smoothing.packed import PackedMarkers
 
 LOSS = geman_mcclure()
 SENSOR = MarkerSensor("mocap", 0.005, LOSS, 0.03, {"neck": 0.02})
@@ -59,7 +59,7 @@ def test_residuals_factors_and_evidence_are_those_of_each_match():
         seen = np.isfinite(residuals.values[f]).all(axis=1)
         assert seen.sum() == len(SHOWN[f])
         np.testing.assert_array_equal(residuals.weights[f][~seen], 0.0)
-        for m in packed.matched(f, scene):
+        for m in packed.matched(f, (), scene):
             (left,) = leftovers_at(m, scene)
             own = [residuals.names.index(name) for name in left.names]
             np.testing.assert_allclose(residuals.values[f, own], left.values, atol=1e-12)
@@ -76,8 +76,9 @@ def test_an_estimated_factor_weakens_the_markers_and_not_their_stated_weights():
 
 
 def test_markers_between_the_frames_or_with_another_loss_stay_rows():
-    assert PackedMarkers.of(BODY, measurements(), times() + 0.004, LOSS) is None
-    assert PackedMarkers.of(BODY, measurements(), times(), SQUARED) is None
+    for none in (PackedMarkers.of(BODY, measurements(), times() + 0.004, LOSS),
+                 PackedMarkers.of(BODY, measurements(), times(), SQUARED)):  # fmt: skip
+        assert none.sensors == () and none.values.shape == (4, 0, 3) and none.measurements(0) == ()
     other = MarkerSensor("other", 0.005, LOSS, 0.03)
     scene = Scene(BODY, MOTION.state(0), a_rig())
     late = replace(marker_frame(0, ("r_hip",)), sensor="other", time=0.01)
