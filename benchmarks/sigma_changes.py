@@ -2,7 +2,7 @@
 
 Twins of the takes of `benchmarks.sigma`: the same person, cameras, calibration, marker places and movement, once as it
 is, and once with the ranges of six joints larger, two each by 5, 10 and 20 degrees; other noise. Both go through
-`kinefit.track_take` with the defaults, and `changes`, which the window shows, says what changed. The draws serve
+`kinefit.track_take` with the defaults, and `range_changes`, which the window shows, says what changed. The draws serve
 nothing else; the bars and the test for one person were looked at on draws 8100 to 8115.
 """
 
@@ -20,9 +20,8 @@ from benchmarks.mixed_runs import MIXES
 from benchmarks.mixed_takes import marked, record, take_text
 from benchmarks.setups import around
 from benchmarks.sigma import FRAMES, JOINTS, SETUPS
-from kinefit import Motion, track_take
+from kinefit import Motion, range_changes, track_take
 from kinefit.exporters.c3d_file import write_markers
-from kinefit.exporters.report.angles import changes
 
 FIRST, TWINS, CHANGES = 9100, 20, (5.0, 10.0, 20.0)  # [deg]
 MOVES = np.radians(3.0)  # the least range of a joint that takes part
@@ -66,7 +65,7 @@ def of_draw(draw: int) -> dict[str, list[tuple[float, float, float]]]:
                 motions.append(track_take(path)[0])
             out[setup] = [
                 (given.get(f"{stem}_{side[0]}", 0.0), *one.change)
-                for stem, side, one in ((*key, one) for key, one in changes(*motions).items())
+                for stem, side, one in ((*key, one) for key, one in range_changes(*motions).items())
                 if f"{stem}_{side[:1]}" in names and one.change
             ]  # fmt: skip
     return out

@@ -87,6 +87,15 @@ def test_what_is_wrong_is_told(args, more, said):
     assert said in str(told.value)
 
 
+def test_an_annotation_for_type_checkers_alone_leaves_the_others_checked():
+    def partly(path: str, thing: "Somewhere"):  # noqa: F821
+        return path
+
+    assert checked(partly)("a", 3) == "a"
+    with pytest.raises(ObservationError, match="partly: path is a int. Give str"):
+        checked(partly)(3, 3)
+
+
 def test_what_is_missing_is_python_s_own_error():
     with pytest.raises(TypeError):
         some("a")

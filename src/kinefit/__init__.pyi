@@ -31,6 +31,7 @@ from kinefit.batch.many import track_takes as track_takes
 from kinefit.takes.missing import find_cameras as find_cameras
 from kinefit.frame.results import FrameResult as FrameResult
 from kinefit.motion import Motion as Motion
+from kinefit.exporters.report.angles import range_changes as range_changes
 from kinefit.readers.take.file import read_take as read_take
 from kinefit.readers.take.load import load_observations as load_observations
 from kinefit.sensors.settings import TrackSettings as TrackSettings

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import inspect
 import os
+import sys
 import types
 import typing
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import cache, partial, wraps
 from numbers import Integral, Real
 from typing import Any, TypeVar
@@ -111,8 +113,12 @@ def rgb_image(image: ArrayLike, what: str = "an image") -> NDArray:
 def _hints(function: Callable[..., Any]) -> dict[str, Any]:
     try:
         return typing.get_type_hints(function)
-    except NameError:  # imported for type checkers alone
-        return {}
+    except NameError:  # some are imported for type checkers alone
+        known, out = vars(sys.modules[function.__module__]), dict[str, Any]()
+        for one in function.__annotations__.items():
+            with suppress(NameError):
+                out |= typing.get_type_hints(types.SimpleNamespace(__annotations__=dict([one])), known)
+        return out
 
 
 @cache

@@ -15,7 +15,7 @@ from kinefit.app.served import ScenePage
 from kinefit.batch.viewed import content_of, gather, has_same_cameras
 from kinefit.errors import ObservationError
 from kinefit.exporters.pictures.overlay import draw_overlay
-from kinefit.exporters.report.angles import RangeChange, changes, with_error
+from kinefit.exporters.report.angles import RangeChange, range_changes, with_error
 from kinefit.exporters.tables import curves, spoken
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
@@ -154,7 +154,7 @@ class Comparison(OpenResult):
         super().__init__(before / "motion.npz", after / "motion.npz")
         content = gather(self._files)
         first, second = content.motions
-        self.ranges = tuple(_row(*key, of) for key, of in changes(first, second).items())
+        self.ranges = tuple(_row(*key, of) for key, of in range_changes(first, second).items())
         known = {curve.name: curve for curve in curves(first) if curve.unit == "deg"}
         self.angles = {curve.name: (known[curve.name], curve) for curve in curves(second) if curve.name in known}
         self.times = first.times - first.times[0], second.times - second.times[0]

@@ -7,7 +7,7 @@ import pytest
 from tests.exporters.report.test_page import own
 from tests.exporters.synthetic import smooth_motion
 
-from kinefit.exporters.report.angles import MAX_STD_DEG, all_ranges, changes, extremes, ranges_of, ranges_table
+from kinefit.exporters.report.angles import MAX_STD_DEG, all_ranges, extremes, range_changes, ranges_of, ranges_table
 from kinefit.exporters.tables import NAMES, Curve, curves
 from kinefit.lasting_errors import LastingErrors, ParameterErrors
 from kinefit.motion import BRIEF_S
@@ -124,20 +124,20 @@ def test_a_change_lacks_the_errors_that_two_takes_of_a_person_share():
 
     before, after = of([0.0, 0.4]), of([0.0, 0.4])
     key = ("knee_angle", "left")
-    alone = changes(before, replace(after, lasting=replace(after.lasting, parameters=None)))[key]
+    alone = range_changes(before, replace(after, lasting=replace(after.lasting, parameters=None)))[key]
     assert alone.change[1] == pytest.approx(np.hypot(alone.before.span[1], alone.after.span[1]))
     low, high = alone.before.ends
     constant_deg = 3.0 * abs(high - low) * 2 / 39
-    shared = changes(before, after)[key]
+    shared = range_changes(before, after)[key]
     assert shared.change == (0.0, pytest.approx((alone.change[1] ** 2 - 8 * constant_deg**2) ** 0.5))
-    assert changes(before, of([0.0, -1.0]))[key].change[1] == pytest.approx(alone.change[1])  # somebody else
-    assert changes(before, of([0.0, 0.4], ("l", "r")))[key].change[1] == pytest.approx(alone.change[1])
+    assert range_changes(before, of([0.0, -1.0]))[key].change[1] == pytest.approx(alone.change[1])  # somebody else
+    assert range_changes(before, of([0.0, 0.4], ("l", "r")))[key].change[1] == pytest.approx(alone.change[1])
     wider = np.array(motion.angles)
     column = list(motion.body.tree.coordinates).index("knee_angle_l")
     wider[:, column] *= 2.0
-    more = changes(before, replace(after, angles=wider))[key]
+    more = range_changes(before, replace(after, angles=wider))[key]
     assert more.change[0] == pytest.approx(shared.before.span[0]) and more.is_clear == (more.change[0] > more.change[1])
     blind = np.array(motion.dof_std)
     blind[:, 6 + column] = np.inf
-    unseen = changes(before, replace(after, dof_std=blind))[key]
+    unseen = range_changes(before, replace(after, dof_std=blind))[key]
     assert unseen.change is None and unseen.after is None and not unseen.is_clear

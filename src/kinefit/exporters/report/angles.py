@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.cycles import PERCENT, Cycles, Norms, normalised
 from kinefit.exporters.tables import DIGITS, FINGER_JOINTS, NAMES, Curve, curves, spoken
@@ -248,8 +249,19 @@ class RangeChange:
         return self.change is not None and abs(self.change[0]) > self.change[1]
 
 
-def changes(before: Motion, after: Motion) -> dict[tuple[str, str], RangeChange]:
-    """{coordinate without its side, side: how its range changed} of all angles of the first motion."""
+@checked
+def range_changes(before: Motion, after: Motion) -> dict[tuple[str, str], RangeChange]:
+    """How the range of motion of every angle changed from one take to another.
+
+    Parameters
+    ----------
+    before, after : of one person, or of two; whether of one is tested by lengths and landmarks that both measured
+
+    Returns
+    -------
+    {(coordinate without its side, side): RangeChange}
+        Of all angles of the first motion; the side is "left", "right" or "" of the body's middle.
+    """
     later, shared = ranges_of(after), None
     if before.lasting is not None and after.lasting is not None:
         shared = common(before.lasting, after.lasting)
