@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from decimal import Decimal
+from pathlib import PurePath
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.errors import ObservationError
 from kinefit.observations.recordings import Keypoints
 
 _MAX_JITTER_STEPS = 0.15  # some containers round to milliseconds, 0.12 steps of 240 Hz
@@ -16,6 +22,20 @@ _MAX_MEDIANS = 3  # of a distance that is used for the rate
 _MAX_GAP_MEDIANS = 2.1  # of a gap that is interpolated: one frame is missing
 _MAX_MOVE_SHARE = 0.5  # of a person's extent: mean distance of its points in two consecutive frames
 _MIN_MOVE_PX = 20.0  # [px] of that distance is always allowed: some people have a point or two
+
+_NUMBER = re.compile(r"\d+")
+_DECIMAL = re.compile(r"(?:^|[_-])(\d+\.\d+)$")  # the end of a name; "shot.0001" is the frame 1 of a shot
+_UNIX = re.compile(r"(?<!\d)(\d{10})[._](\d{3,9})$")  # seconds and their fraction
+_UNIX_DIGITS = {13: 1e-3, 16: 1e-6, 19: 1e-9}  # [s] of a whole number of so many digits
+_MAX_UNIX_S = 2e9  # in 2033: dates of as many digits begin with 20
+_DATE = re.compile(
+    r"(\d{4})[-_]?(\d\d)[-_]?(\d\d)[-_T ]?(\d\d)[-_:.h]?(\d\d)[-_:.m]?(\d\d)[-_:.,s]?(\d{3,6})(?:ms|us)?$"
+)
+_STEPS_S = (0.0015, 10.0)  # median step of frames, so that decimals are seconds
+_COUNTED_UNITS = (1e-3, 1e-6, 1e-9)  # [s] of whole numbers that count from the start of a recording
+_MIN_COUNTED_STEP = 4  # numbers from one frame to the next, so that they may be milliseconds
+_MAX_RATE_ERROR = 0.05  # of a rate by such numbers, to the stated rate
+_MAX_NUMBER_STEP = 1.5  # of the numbers in two names, in median steps: with more a frame is missing
 
 
 def is_even(times: NDArray, rate: float) -> bool:
@@ -36,6 +56,161 @@ def nominal_rate(times: NDArray) -> float:
 def frame_times(count: int, rate: float, clock: NDArray | None = None) -> NDArray:
     """(N,) [s] from the first of `count` frames: those of a video's `clock` (N,) if it has as many, else even ones."""
     return clock if clock is not None and len(clock) == count else np.arange(count) / rate
+
+
+@dataclass(frozen=True, eq=False)
+class NamedFrames:
+    """What the names of a recording's files, one a frame, state of time.
+
+    Parameters
+    ----------
+    numbers : (N,) int or None
+        Of the frames; None where names have no number of their own.
+    times : (N,) [s] or None
+        By the names, on their own clock; None where they state none.
+    file_names : (N,)
+    """
+
+    file_names: tuple[str, ...]
+    numbers: NDArray | None = None
+    times: NDArray | None = None
+
+    @property
+    def step(self) -> int:
+        """Most frequent step of the numbers: the lower median."""
+        steps = () if self.numbers is None else np.sort(np.diff(self.numbers))
+        return int(steps[(len(steps) - 1) // 2]) if len(steps) else 1
+
+    @property
+    def gaps(self) -> NDArray:
+        """(G,) int: frames before which others are missing, by their numbers."""
+        if self.numbers is None:
+            return np.zeros(0, int)
+        return np.flatnonzero(np.diff(self.numbers) > _MAX_NUMBER_STEP * self.step) + 1
+
+    def on_clock(self, rate: float, what: str = "files") -> tuple[NDArray, str]:
+        """Times (N,) [s] of the frames from the first on, and what is worth saying of them; "" for even ones.
+
+        Parameters
+        ----------
+        rate : float [Hz] at which the numbers count, if they are not times themselves
+        what : name of the files, for what is said
+        """
+        if self.times is not None:
+            return self.times - self.times[0], f"the names of its {what} are taken as their times"
+        count = len(self.file_names)
+        if self.numbers is None or count < 2:
+            return np.arange(count) / rate, ""
+        numbers, step = self.numbers - self.numbers[0], self.step
+        mean, between = float(numbers[-1]) / (count - 1), f"{self.file_names[0]} and {self.file_names[1]}"
+        for unit in _COUNTED_UNITS if step >= _MIN_COUNTED_STEP else ():
+            if abs(step * unit * rate - 1.0) < _MAX_RATE_ERROR:
+                said = f"the numbers of its {what} step by about {step} ({between}): taken as times in {unit:g} s, "
+                return numbers * unit, f"{said}{rate:.4g} Hz; frames of which others were left out look the same"
+        if step / rate > _STEPS_S[1]:
+            said = f"the numbers of its {what} step by about {step} ({between}): not used, frames are even at "
+            return np.arange(count) / rate, f"{said}{rate:.4g} Hz. If they are times, write time_unit"
+        if step > 1:
+            said = f"the numbers of its {what} step by {step} ({between}): taken as frames of {rate:.4g} Hz, of which "
+            said += f"every {_ordinal(step)} is there. If the {what} themselves have {rate:.4g} Hz, write "
+            return numbers / rate, f"{said}rate = {rate * mean:.4g}"
+        missing = int(numbers[-1]) + 1 - count
+        at = self.file_names[self.gaps[0]] if len(self.gaps) else ""
+        said = f"{missing} numbers are missing among its {what}, the first before {at}: nothing is seen at their times"
+        return numbers / rate, said if missing else ""
+
+    def refuse_gaps(self, what: str) -> None:
+        """Raise ObservationError where numbers of frames are missing between others."""
+        if len(self.gaps) and self.numbers is not None and self.times is None:
+            before, after = self.file_names[self.gaps[0] - 1], self.file_names[self.gaps[0]]
+            count = int(self.numbers[-1] - self.numbers[0]) // self.step + 1 - len(self.numbers)
+            raise ObservationError(
+                f"{what} are missing between {before} and {after}, {count} in all",
+                remedy="Copy them again, or remove all later ones, or number them without a gap.",
+            )
+
+
+def counted_times(file_names: Sequence[str], unit: float) -> NDArray:
+    """Times (N,) [s] from the first on, by the last number in every name, in a unit [s].
+
+    Raises
+    ------
+    ObservationError
+        A name without a number.
+    """
+    stems = [PurePath(name).stem for name in file_names]
+    found = [_DECIMAL.findall(stem) or _NUMBER.findall(stem) for stem in stems]
+    if not found or not all(found):
+        raise ObservationError("the file names have no number", remedy="Remove time_unit, give rate.")
+    counts = [Decimal(numbers[-1]) for numbers in found]
+    return np.array([float(count - counts[0]) for count in counts]) * unit
+
+
+def _ordinal(number: int) -> str:
+    return {2: "second", 3: "third"}.get(number, f"{number}th")
+
+
+def frames_by_name(file_names: Sequence[str], what: str = "files") -> NamedFrames:
+    """Frame numbers or times of a recording's files, from their names in natural order.
+
+    A number of seconds since 1970 or of a date is a time, and so is a decimal number of seconds at the end of a name.
+    Else the last number that differs between the names is the frame's.
+
+    Raises
+    ------
+    ObservationError
+        Two files with one number.
+    """
+    file_names = tuple(file_names)
+    stems = [PurePath(name).stem for name in file_names]
+    if len(stems) < 2:
+        return NamedFrames(file_names)
+    for read in (_seconds, _decimal_seconds):
+        found = [read(stem) for stem in stems]
+        times = np.array([time for time in found if time is not None])
+        if len(times) == len(stems) and (steps := np.diff(times)).min() > 0.0:
+            if _STEPS_S[0] < np.median(steps) < _STEPS_S[1]:
+                return NamedFrames(file_names, times=times)
+    columns = [[int(number) for number in _NUMBER.findall(stem)] for stem in stems]
+    if not all(columns):
+        return NamedFrames(file_names)
+    alike = len({_NUMBER.sub("#", stem) for stem in stems}) == 1
+    varying = [k for k in range(len(columns[0])) if len({row[k] for row in columns}) > 1] if alike else []
+    numbers = [row[varying[-1] if varying else -1] for row in columns]
+    if max(numbers) - min(numbers) > 2**53:
+        return NamedFrames(file_names)
+    steps = np.diff(np.array(numbers, float))
+    if (steps <= 0).any():
+        i = int(np.argmax(steps <= 0))
+        if len(set(numbers)) == len(numbers):
+            return NamedFrames(file_names)  # names that count in another way
+        raise ObservationError(
+            f"two {what} with one number: {file_names[i]} and {file_names[i + 1]}",
+            remedy='Name those of this camera by a pattern: "folder/left_*.png".',
+        )
+    return NamedFrames(file_names, np.array(numbers))
+
+
+def _seconds(stem: str) -> float | None:
+    """Seconds since 1970 that a name states, by their number or a date; None without."""
+    if unix := _UNIX.search(stem):
+        return float(f"{unix[1]}.{unix[2]}")
+    last = _NUMBER.findall(stem)
+    unit = _UNIX_DIGITS.get(len(last[-1])) if last else None
+    if unit is not None and _MAX_UNIX_S / 2.0 < int(last[-1]) * unit < _MAX_UNIX_S:
+        return int(last[-1]) * unit
+    if date := _DATE.search(stem):
+        try:
+            return datetime(*map(int, date.groups()[:6]), int(f"{date[7]:0<6}"), UTC).timestamp()  # type: ignore[arg-type]
+        except ValueError:
+            return None
+    return None
+
+
+def _decimal_seconds(stem: str) -> float | None:
+    """Decimal number at the end of a name; None without."""
+    found = _DECIMAL.search(stem)
+    return float(found[1]) if found else None
 
 
 def unevenness(times: NDArray, rate: float) -> str:

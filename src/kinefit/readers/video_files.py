@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import av
 import numpy as np
@@ -26,6 +26,8 @@ _REMEDY = "Copy the file again from its source, or re-encode it."
 
 class VideoFile:
     """One video file, whose frames are counted by reading all packets, as headers may be wrong."""
+
+    note: ClassVar[str] = ""  # packets state their times
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -22,7 +22,7 @@ COUNTS[:, :5] = 0
 METRES = COUNTS * np.float32(0.001)
 
 
-def png(folder, names=("f8.png", "f9.png", "f10.png", "f11.png", "f100.png"), counts=COUNTS):
+def png(folder, names=("f8.png", "f9.png", "f10.png", "f11.png", "f12.png"), counts=COUNTS):
     folder.mkdir(parents=True, exist_ok=True)
     for name, image in zip(names, counts):
         cv2.imwrite(str(folder / name), image)

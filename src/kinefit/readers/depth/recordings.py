@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import builtins
-import re
 from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
 from kinefit.errors import FileError, ObservationError, names_file
+from kinefit.observations.clocks import counted_times, frames_by_name
 from kinefit.observations.videos import CloudVideo, DepthVideo
 from kinefit.readers.depth import clouds
 from kinefit.readers.depth.images import PICTURES, DepthSource, array_source, listed, picture_source, raw_source
@@ -29,6 +29,7 @@ _MAX_MEDIAN_DEPTH = 30.0  # [m] no sensor shows a person farther away
 _PERSON_DISTANCES = (0.4, 6.0)  # [m] typical range in front of a depth sensor
 _COUNT_UNITS = (1.0, 0.001, 0.01, 0.000125, 0.0001, 0.0002, 0.00025)  # [m] of sensors and data sets
 _DEFAULT_RATE = 30.0  # [Hz] of nearly every depth camera
+_MAX_MULTIPLE_ERROR = 0.1  # of the stated rate to that of the times in names: a whole number
 
 
 @checked
@@ -66,7 +67,8 @@ def read_depth(
     range : (near, far) [m]
         Measurements outside of it are discarded.
     time_unit : float [s], optional
-        Unit of the last number in every file's name, if that is a time; default: frames are evenly spaced.
+        Unit of the last number in every file's name, if that is a time. Default: seconds since 1970, dates and decimal
+        seconds in the names are times; other numbers count frames at `rate`, also where they step by more than one.
     time_offset : float [s]
         Time of the first frame in the take.
 
@@ -80,11 +82,11 @@ def read_depth(
     path = Path(path)
     name = sensor or path.stem
     source = _source(path, name, size)
-    times, rate = _times(source, rate, usual_rate, time_unit, time_offset)
+    times, rate, said = _times(source, rate, usual_rate, time_unit, time_offset, "depth images")
     factor = _factor(unit if unit is not None else source.unit)
     video = DepthVideo(
         name, rate, times, source.size, _scaled(source.image, factor), float(range[0]), float(range[1]),
-        source.camera, source=str(path),
+        source.camera, source=str(path), notes=said,
     )  # fmt: skip
     _check_content(video, factor)
     return video
@@ -128,14 +130,14 @@ def read_clouds(
         raise _nothing(f"clouds ({', '.join(clouds.ENDINGS)})")
     name = sensor or path.stem
     source = DepthSource(len(files), lambda i: np.zeros((1, 1)), (1, 1), unit, names=tuple(f.name for f in files))
-    times, rate = _times(source, rate, usual_rate, time_unit, time_offset)
+    times, rate, said = _times(source, rate, usual_rate, time_unit, time_offset, "clouds")
     first = clouds.read_cloud(files[0])
     T = np.array(first.T_file_sensor if T_world_sensor is None else T_world_sensor, float)
     if T_world_sensor is None:
         T[:3, 3] *= unit
     video = CloudVideo(
         name, rate, times, lambda i: clouds.in_sensor(clouds.read_cloud(files[i])) * unit, T, viewpoint,
-        float(range[0]), float(range[1]), source=str(path),
+        float(range[0]), float(range[1]), source=str(path), notes=said,
     )  # fmt: skip
     points = clouds.in_sensor(first)
     away = np.linalg.norm(points[np.isfinite(points).all(axis=1)], axis=1) * unit
@@ -209,33 +211,37 @@ def _depth(file: Path) -> NDArray:
 
 
 def _times(
-    source: DepthSource, rate: float | None, default_rate: float | None, time_unit: float | None, time_offset: float
-) -> tuple[NDArray, float]:
-    """Times (F,) [s] and rate [Hz]; the caller's values come before the file's."""
-    times = source.times
+    source: DepthSource, rate: float | None, default_rate: float | None, time_unit: float | None, time_offset: float,
+    what: str,
+) -> tuple[NDArray, float, tuple[str, ...]]:  # fmt: skip
+    """Times (F,) [s], rate [Hz], what is worth saying of them; the caller's values come before the file's."""
+    times, said = source.times, ""
     if time_unit is not None:
-        numbers = [re.findall(r"\d+", name) for name in source.names]
-        if not numbers or not all(numbers):
-            raise ObservationError("the file names have no number", remedy="Remove time_unit, give rate.")
-        counts = [int(found[-1]) for found in numbers]
-        times = np.array([count - counts[0] for count in counts], float) * time_unit
+        times = counted_times(source.names, time_unit)
     if not (np.isfinite(time_offset) and (time_unit is None or (np.isfinite(time_unit) and time_unit > 0))):
         raise ObservationError(f"time unit {time_unit} s, offset {time_offset} s", remedy="Give seconds.")
     if rate is not None and not 0 < rate < 1e6:
         raise ObservationError(f"rate {rate:g} Hz", remedy="Give frames per second.")
+    numbered = frames_by_name(source.names, what) if times is None and len(source.names) > 1 else None
+    if numbered is not None and (numbered.times is not None or rate or default_rate):
+        times, said = numbered.on_clock(rate or default_rate or _DEFAULT_RATE, what)
+        times = times if said else None
     if times is None:
         rate = rate or source.rate or (default_rate if source.count > 1 else _DEFAULT_RATE)
         if rate is None:
             raise ObservationError("its rate is not stated", remedy="Give rate = ... in frames per second.")
-        return np.arange(source.count) / rate + time_offset, rate
+        return np.arange(source.count) / rate + time_offset, rate, ()
     steps = np.diff(times)
     measured = 1.0 / float(np.median(steps[steps > 0])) if (steps > 0).any() else None
+    if said and measured and rate and abs(rate / measured - round(rate / measured)) < _MAX_MULTIPLE_ERROR:
+        rate = measured  # frames were left out, by their names
     if rate is not None and measured is not None and not 0.9 < rate / measured < 1.1:
         problem = f"the times of its frames give {measured:.4g} Hz, not {rate:g} Hz"
         raise ObservationError(problem, remedy="Remove the rate, or correct the unit of the times.")
     if source.rate and measured and abs(source.rate / measured - 1.0) < 0.1:
         measured = source.rate  # times are rounded to milliseconds
-    return times + time_offset, rate or measured or source.rate or default_rate or _DEFAULT_RATE
+    rate = rate or measured or source.rate or default_rate or _DEFAULT_RATE
+    return times + time_offset, rate, (said,) if said else ()
 
 
 def _factor(unit: float) -> float:
