@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from decimal import Decimal
 from pathlib import PurePath
 
@@ -201,7 +201,7 @@ def _seconds(stem: str) -> float | None:
         return int(last[-1]) * unit
     if date := _DATE.search(stem):
         try:
-            return datetime(*map(int, date.groups()[:6]), int(f"{date[7]:0<6}"), UTC).timestamp()  # type: ignore[arg-type]
+            return datetime.strptime("".join(date.groups()) + "+0000", "%Y%m%d%H%M%S%f%z").timestamp()
         except ValueError:
             return None
     return None

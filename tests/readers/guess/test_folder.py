@@ -468,7 +468,7 @@ def test_what_kinefit_left_is_no_recording(folder, rig):
 
 def test_an_empty_folder_and_none(folder):
     (folder / "readme.txt").write_text("nothing")
-    with pytest.raises(TakeError, match="no videos, keypoints, markers or recordings among 1 files"):
+    with pytest.raises(TakeError, match="no videos, keypoints, markers, depth or recordings among 1 files"):
         guess_take(folder)
     with pytest.raises(TakeError, match="no such folder"):
         guess_take(folder / "none")

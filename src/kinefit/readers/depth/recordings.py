@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import builtins
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
@@ -11,17 +13,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
+from kinefit._files import read_text
 from kinefit.errors import FileError, ObservationError, names_file
 from kinefit.observations.clocks import counted_times, frames_by_name
 from kinefit.observations.videos import CloudVideo, DepthVideo
 from kinefit.readers.depth import clouds
-from kinefit.readers.depth.images import PICTURES, DepthSource, array_source, listed, picture_source, raw_source
+from kinefit.readers.depth.images import (
+    PICTURES,
+    DepthSource,
+    array_source,
+    listed,
+    npy_source,
+    picture_source,
+    raw_source,
+)
 from kinefit.readers.depth.streams import bag_source, track_source
 from kinefit.readers.ros.images import mcap_source
 from kinefit.readers.ros.recordings import inside
 
 FORMATS = (
-    "a folder of 16-bit PNG or TIFF, of raw 16-bit files or of organised PCD clouds; .npz; Azure Kinect .mkv; "
+    "a folder of 16-bit PNG or TIFF, of .npy, of raw 16-bit files or of organised PCD clouds; .npz; Azure Kinect .mkv; "
     "RealSense .bag; .mcap of ROS 2"
 )
 _MIN_MEDIAN_DEPTH = 0.1  # [m] no sensor measures nearer
@@ -29,6 +40,9 @@ _MAX_MEDIAN_DEPTH = 30.0  # [m] no sensor shows a person farther away
 _PERSON_DISTANCES = (0.4, 6.0)  # [m] typical range in front of a depth sensor
 _COUNT_UNITS = (1.0, 0.001, 0.01, 0.000125, 0.0001, 0.0002, 0.00025)  # [m] of sensors and data sets
 _DEFAULT_RATE = 30.0  # [Hz] of nearly every depth camera
+_MIN_SHARE_OF_EIGHT = 0.6  # of the different counts: by chance an eighth
+_MIN_DIFFERENT_COUNTS = 15  # of an image, so that their multiples are no chance
+_MAX_ROUGHNESS = 0.1  # of a depth: median difference of neighbouring pixels; of depth cameras below 0.02
 _MAX_MULTIPLE_ERROR = 0.1  # of the stated rate to that of the times in names: a whole number
 
 
@@ -51,7 +65,8 @@ def read_depth(
     Parameters
     ----------
     path : file, folder or pattern (frames/depth_*.png)
-        16-bit PNG or TIFF (float TIFF: metres), raw little-endian 16-bit files, .npz (`depth` (F, H, W), optional
+        16-bit PNG or TIFF (float TIFF: metres), raw little-endian 16-bit files (or float16, float32 in metres), .npy of
+        one image a file, .npz (`depth` (F, H, W), optional
         `times` [s], `unit` [m], `rate` [Hz]), organised PCD, Azure Kinect .mkv, RealSense .bag, .mcap of ROS 2, with
         the topic as a part of the path if several have depth (session.mcap/front/depth/image_raw). Files are taken
         in the order of the numbers in their names.
@@ -81,15 +96,22 @@ def read_depth(
     """
     path = Path(path)
     name = sensor or path.stem
-    source = _source(path, name, size)
+    source = _source(path, name, size, unit)
     times, rate, said = _times(source, rate, usual_rate, time_unit, time_offset, "depth images")
+    notes = [*source.notes, *said]
+    if unit is None and source.unit == 0.001 and not source.stated:
+        likely, why = _unit_of_counts(path, source)
+        source, notes = replace(source, unit=likely), [*notes, *([why] if why else [])]
     factor = _factor(unit if unit is not None else source.unit)
     video = DepthVideo(
         name, rate, times, source.size, _scaled(source.image, factor), float(range[0]), float(range[1]),
-        source.camera, source=str(path), notes=said,
+        source.camera, source=str(path),
     )  # fmt: skip
-    _check_content(video, factor)
-    return video
+    roughness = _check_content(video, factor)
+    if roughness > _MAX_ROUGHNESS:
+        differ = f"neighbouring pixels of {path.name} differ by {100 * roughness:.0f} %"
+        notes.append(f"{differ}: infrared images, photographs in 16 bits and depth that is mostly noise look so")
+    return replace(video, notes=tuple(notes))
 
 
 @checked
@@ -151,7 +173,7 @@ def is_unordered(path: Path) -> bool:
     return bool(files) and clouds.read_cloud(files[0]).shape is None
 
 
-def _source(path: Path, name: str, size: tuple[int, int] | None) -> DepthSource:
+def _source(path: Path, name: str, size: tuple[int, int] | None, unit: float | None) -> DepthSource:
     if (found := inside(path)) is not None:
         return mcap_source(found[0], name, found[1])
     files = listed(path)
@@ -174,7 +196,49 @@ def _source(path: Path, name: str, size: tuple[int, int] | None) -> DepthSource:
     if size is None and (colour := _of_ending(files, (".jpg", ".jpeg", ".bmp", ".gif"))):
         problem = f"{colour[0].suffix} files hold colour, not depth"
         raise FileError(problem, remedy=f"kinefit reads {FORMATS}.")
-    return raw_source(files, size)
+    if arrays := _of_ending(files, (".npy",)):
+        return npy_source(arrays)
+    return raw_source(files, size, unit)
+
+
+def _unit_of_counts(path: Path, source: DepthSource) -> tuple[float, str]:
+    """Unit [m] of 16-bit counts that no file states, and what is worth saying of it; millimetres without evidence.
+
+    Lists of a TUM RGB-D folder beside the images state their convention. First Kinects keep three bits of each count
+    for the number of a person: most counts are multiples of eight.
+    """
+    counts = [np.asarray(source.image(k)) for k in sorted({0, source.count // 2, source.count - 1})]
+    values = np.concatenate([image[(image > 0) & np.isfinite(image)] for image in counts])
+    if not len(values) or any(image.dtype.kind == "f" and (image % 1 != 0).any() for image in counts):
+        return 0.001, ""
+    median = float(np.median(values))
+    listed_beside = next((f for f in (path.parent, path) for f in _tum_lists(f)), None)
+    if listed_beside is not None:
+        said = f"{listed_beside.name} is a list of a TUM RGB-D folder, so 5000 counts are taken as a metre:"
+        said += f" unit = 0.0002, a median of {0.0002 * median:.3g} m"
+        return 0.0002, f"{said}. Counts of millimetres would be unit = 0.001"
+    if 0.001 * median <= _PERSON_DISTANCES[1]:
+        return 0.001, ""
+    different = np.unique(values)
+    of_eight = float(np.mean(different % 8 == 0)) if len(different) > _MIN_DIFFERENT_COUNTS else 0.0
+    if of_eight > _MIN_SHARE_OF_EIGHT and _PERSON_DISTANCES[0] < 0.000125 * median < _PERSON_DISTANCES[1]:
+        said = f"{100 * of_eight:.0f} % of its different counts are multiples of 8, as those of first Kinects with a"
+        said += " person's number in three bits: taken as unit = 0.000125"
+        return 0.000125, f"{said}. Depth in steps of 8 mm would be unit = 0.001"
+    likely = [u for u in _COUNT_UNITS if u < 0.001 and _PERSON_DISTANCES[0] < median * u < _PERSON_DISTANCES[1]]
+    units = ", ".join(f"{unit:g} ({unit * median:.2g} m)" for unit in likely)
+    said = f"no file states the unit of its counts: as millimetres the median depth is {0.001 * median:.3g} m, farther "
+    said += "than a depth camera sees people well. A hall looks the same; else write unit = "
+    return 0.001, said + (units or "...")
+
+
+def _tum_lists(folder: Path) -> Iterator[Path]:
+    """Lists of depth images in the TUM RGB-D convention."""
+    for name in ("depth.txt", "associations.txt", "associate.txt", "assoc.txt"):
+        if (file := folder / name).is_file():
+            rows = read_text(file, "it", remedy="", errors="replace")[:4000].splitlines()
+            if any(re.match(r"\s*\d+\.\d+\s+\S*depth\S*\.png|.*\s\d+\.\d+\s+\S*depth\S*\.png", row) for row in rows):
+                yield file
 
 
 def _of_ending(files: list[Path], endings: tuple[str, ...]) -> list[Path]:
@@ -254,8 +318,12 @@ def _scaled(image: Callable[[int], NDArray], factor: float) -> Callable[[int], N
     return lambda i: image(i) * np.float32(factor)
 
 
-def _check_content(video: DepthVideo, factor: float) -> None:
-    """Check some frames for depth, a plausible unit and a range that contains it; raises ObservationError."""
+def _check_content(video: DepthVideo, factor: float) -> float:
+    """Check some frames for depth, a plausible unit and a range that contains it; raises ObservationError.
+
+    Returns the median difference of neighbouring pixels, as a share of the depth.
+    """
+    rough: list[NDArray] = []
     seen: list[NDArray] = []
     first = dict.fromkeys(round(k) for k in np.linspace(0, len(video) - 1, 5))
     for i in (*first, *(k for k in builtins.range(len(video)) if k not in first)):
@@ -263,11 +331,16 @@ def _check_content(video: DepthVideo, factor: float) -> None:
             break  # read the others only while all are empty
         image = np.asarray(video.image(i))
         if image.shape == video.size[::-1]:
+            pairs = image[:, :-1], image[:, 1:]
+            known = np.isfinite(image[:, :-1] + image[:, 1:]) & (np.minimum(*pairs) > 0)
+            rough.append(np.abs(pairs[1] - pairs[0])[known] / pairs[0][known])
             image = image[::4, ::4] if image.size > 40_000 else image
             seen.append(image[(image > 0) & np.isfinite(image)])
         else:
             video.frame(i)  # raises for the wrong size
     _check_values(np.concatenate(seen), factor, video.near, video.far)
+    differences = np.concatenate(rough)
+    return float(np.median(differences)) if len(differences) else 0.0
 
 
 def _check_values(depth: NDArray, factor: float, near: float, far: float, least: float = _MIN_MEDIAN_DEPTH) -> None:
@@ -277,7 +350,7 @@ def _check_values(depth: NDArray, factor: float, near: float, far: float, least:
     median = float(np.median(depth))
     if not least < median < _MAX_MEDIAN_DEPTH:
         likely = [unit for unit in _COUNT_UNITS if _PERSON_DISTANCES[0] < median / factor * unit < _PERSON_DISTANCES[1]]
-        entry = f"unit = {likely[0]:g}" if likely else "the sensor's own unit = ..."
+        entry = "unit = " + " or ".join(f"{unit:g}" for unit in likely) if likely else "the sensor's own unit = ..."
         what = " (probably millimetres)" if factor == 1.0 and median > 100 else ""
         problem = f"the median depth is {median:.4g} m{what}: the unit of {factor:g} m a count is wrong"
         raise ObservationError(problem, remedy=f"Write {entry} (metres a count).")

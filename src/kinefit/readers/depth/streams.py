@@ -11,7 +11,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import CalibrationError, FileError, ObservationError, extra, names_file
+from kinefit.errors import CalibrationError, FileError, KinefitError, ObservationError, extra, names_file
 from kinefit.geometry.camera import Camera
 from kinefit.readers.depth.images import DepthSource
 from kinefit.readers.video_files import open_container
@@ -109,14 +109,31 @@ def track_source(path: Path, name: str) -> DepthSource:
     )  # fmt: skip
 
 
+def depth_tracks(path: Path) -> str:
+    """Titles of the depth tracks of a container, as recorders name them; "" without."""
+    try:
+        with open_container(path) as container:
+            return ", ".join(_title(stream) for stream in container.streams.video if _is_named_depth(stream))
+    except KinefitError:
+        return ""
+
+
+def _title(stream: Any) -> str:
+    return str(stream.metadata.get("title", f"track {stream.index}"))
+
+
+def _is_named_depth(stream: Any) -> bool:
+    return _title(stream).upper() == "DEPTH" or "K4A_DEPTH_MODE" in stream.metadata
+
+
 def _depth_stream(container: Any) -> Any:
     videos = container.streams.video
-    named = [s for s in videos if s.metadata.get("title", "").upper() == "DEPTH" or "K4A_DEPTH_MODE" in s.metadata]
+    named = [stream for stream in videos if _is_named_depth(stream)]
     if named:
         return named[0]
     if len(videos) == 1:
         return videos[0]
-    titles = ", ".join(s.metadata.get("title", f"track {s.index}") for s in videos) or "none"
+    titles = ", ".join(map(_title, videos)) or "none"
     raise FileError(f"no depth track; its video tracks: {titles}", remedy="Record with the depth camera on.")
 
 

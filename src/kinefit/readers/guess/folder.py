@@ -15,7 +15,7 @@ from kinefit.readers.guess import files as guess_files
 from kinefit.readers.guess.cameras import describe_cameras, describe_uncalibrated
 from kinefit.readers.guess.draft import Draft, Entry, Note, Value
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile
-from kinefit.readers.guess.names import trials
+from kinefit.readers.guess.names import COUNTED, later_chapters, trials
 from kinefit.readers.markers import read_markers
 from kinefit.readers.ros.images import Shown, mcap_rig, shown
 from kinefit.readers.take.entries import TABLES
@@ -27,6 +27,7 @@ _CALIBRATE = (
 )
 
 
+_LEVEL_CAMERA = "the world is the camera's frame, assumed level: y points down"
 OPEN_HEIGHT = "height = 1.75  # open: the stature in metres, where you know it"
 """The commented line of a take file for the person's height."""
 
@@ -67,19 +68,24 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
     draft = Draft(folder, Path(beside).absolute() if beside else folder)
     files = guess_files.list_files(folder)
     videos, markers = guess_files.find_videos(files, folder), guess_files.find_markers(files)
+    videos = _without_chapters(draft, videos)
+    _describe_unreadable(draft, files)
     keypoints, remarks = guess_files.find_keypoints(files)
     recordings = guess_files.find_recordings(files)
     for remark in remarks:
         draft.note("keypoints", "open", remark)
     _describe_kinds(draft, files)
+    videos = _describe_depth(draft, files, videos, alone=not (keypoints or markers or recordings))
     if not (videos or keypoints or markers or recordings or any(draft.tables.values())):
+        said = "; ".join(note.text for note in draft.notes)
         raise TakeError(
-            f"no videos, keypoints, markers or recordings among {len(files)} files", file=folder,
-            remedy="Name a folder with videos (.mp4, .avi ...) or keypoints and a calibration, or with .c3d, .trc or "
-            ".mcap (ROS 2).",
+            f"no videos, keypoints, markers, depth or recordings among {len(files)} files{said and f': {said}'}",
+            file=folder,
+            remedy="Name a folder with videos (.mp4, .avi ...) or keypoints and a calibration, with depth images, "
+            ".c3d, .trc or .mcap (ROS 2).",
         )
     if videos or keypoints:
-        calibration = _choose_calibration(draft, files, videos + [k.path for k in keypoints], bool(markers))
+        calibration = _choose_calibration(draft, files, videos, [k.path for k in keypoints], bool(markers))
         if calibration is not None:
             describe_cameras(draft, calibration, videos, keypoints)
     if recordings:
@@ -87,6 +93,49 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
     _describe_markers(draft, markers)
     draft.comments.append(OPEN_HEIGHT)
     return Guess(draft.text(), tuple(draft.notes))
+
+
+def _without_chapters(draft: Draft, videos: list[Path]) -> list[Path]:
+    """The videos without those that continue another one; they become notes."""
+    chapters = later_chapters(videos)
+    for path, first in chapters.items():
+        text = f"{draft.name(path)} is a later chapter of {draft.name(first)}: one camera. Not used; join them: "
+        text += "ffmpeg -f concat -i list.txt -c copy OUT.mp4, with a line \"file 'NAME'\" of each in list.txt"
+        draft.note("video", "likely", text)
+    return [path for path in videos if path not in chapters]
+
+
+def _describe_depth(draft: Draft, files: Sequence[Path], videos: Sequence[Path], *, alone: bool) -> list[Path]:
+    """Enter depth of folders and of tracks in videos; returns the videos that are colour alone.
+
+    Beside no other sensor the world is that of the first depth camera; beside others depth is a comment.
+    """
+    found = guess_files.find_depth(files)
+    for path, problem in found.unusable.items():
+        draft.note("depth", "open", f"{draft.name(path)}: {problem}")
+    colour = [path for path in videos if path not in found.usable]
+    for path, video in found.usable.items():
+        is_used = alone and not colour and path == next(iter(found.usable))
+        camera = "the file states its lens" if video.camera is not None else "its lens is not stated"
+        why = f"{len(video)} depth images of {video.size[0]}x{video.size[1]} px; {camera}"
+        entry = {"name": Value(path.stem), "file": Value(path, "likely", why)}
+        if video.camera is None:
+            entry["intrinsics"] = Value(None, "open", "[fx, fy, cx, cy] in pixels of the depth image")
+        draft.tables["depth"].append((is_used, entry))
+        aside = "" if is_used else "; a comment, its pose among the other sensors is not stated"
+        draft.note(f"depth {path.stem}", "likely", f"{draft.name(path)}: {why}{aside}")
+        for text in video.notes:
+            draft.note(f"depth {path.stem}", "likely", text)
+        if is_used:
+            draft.head["up"] = draft.note_value("up", Value("-y", "guess", _LEVEL_CAMERA), "up")
+    return colour
+
+
+def _describe_unreadable(draft: Draft, files: Sequence[Path]) -> None:
+    """Add a note on what a browser or a cloud left in place of a recording."""
+    for path in files:
+        if problem := guess_files.unreadable(path):
+            draft.note("files", "open", f"{draft.name(path)}: {problem}")
 
 
 def _describe_kinds(draft: Draft, files: Sequence[Path]) -> None:
@@ -108,10 +157,9 @@ def _describe_kinds(draft: Draft, files: Sequence[Path]) -> None:
 
 
 def _choose_calibration(
-    draft: Draft, files: list[Path], seen: Sequence[Path], markers: bool
+    draft: Draft, files: list[Path], videos: list[Path], keypoints: list[Path], markers: bool
 ) -> CalibrationFile | None:
     """The calibration that most files fit; from the parent folder if there is none here; None without one."""
-    videos = guess_files.find_videos(files, draft.folder)
     found, singles, faults = guess_files.find_calibrations(files, videos, draft.folder)
     if not found:
         found = guess_files.find_calibrations(_above(draft.folder), videos, draft.folder)[0]
@@ -125,7 +173,7 @@ def _choose_calibration(
             remedy=f"{fault.remedy or ''} {_CALIBRATE}".strip(),
         )
     if not found:
-        if videos and len(seen) == len(videos):
+        if videos and not keypoints:
             if singles:
                 draft.note("calibration", "open", f"{draft.name(singles[0])} has one camera only: not used")
             describe_uncalibrated(draft, _of_one_moment(draft, videos))
@@ -134,7 +182,7 @@ def _choose_calibration(
         raise CalibrationError(f"no calibration of the cameras{alone}", file=draft.folder, remedy=_CALIBRATE)
 
     def fitting(c: CalibrationFile) -> int:
-        return max((len(t.files) for t in trials(seen, draft.folder, c.rig.names)[0]), default=0)
+        return max((len(t.files) for t in trials([*videos, *keypoints], draft.folder, c.rig.names)[0]), default=0)
 
     def rank(c: CalibrationFile) -> tuple[int, bool, int, str]:
         return -fitting(c), not c.is_refined, len(Path(draft.name(c.path)).parts), c.path.name
@@ -157,12 +205,36 @@ def _choose_calibration(
     return best
 
 
-def _of_one_moment(draft: Draft, videos: Sequence[Path]) -> list[Path]:
-    """The videos nearest to the folder, without static trials, calibrations and overlays of a detector."""
+def _of_one_moment(draft: Draft, videos: Sequence[Path]) -> dict[str, Path]:
+    """{camera: video} of those nearest to the folder, without static trials, calibrations and overlays of a detector.
+
+    Raises
+    ------
+    TakeError
+        Two videos of one name.
+    """
     moving = [v for v in videos if not any(p.search(draft.name(v)) for p in (STATIC, DRAWN_ON, OF_CALIBRATION))]
     moving = moving or list(videos)
     depth = min(draft.name(path).count("/") for path in moving)
-    return [path for path in moving if draft.name(path).count("/") == depth]
+    moving = [path for path in moving if draft.name(path).count("/") == depth]
+    folders = list(dict.fromkeys(path.parent for path in moving))
+    if len(folders) > 1 and all(COUNTED.fullmatch(path.stem) for path in moving):  # cameras count their own files
+        for folder in folders:
+            later = [draft.name(path) for path in moving if path.parent == folder][1:]
+            if later:
+                text = f"{', '.join(later)}: later recordings of {folder.name}; kinefit init on a folder of their own"
+                draft.note("video", "guess", text)
+        return {folder.name: next(path for path in moving if path.parent == folder) for folder in folders}
+    named: dict[str, Path] = {}
+    for path in moving:
+        if path.stem in named:
+            first_name = draft.name(named[path.stem])
+            raise TakeError(
+                f"two videos are called {path.stem}: {first_name} and {draft.name(path)}", file=draft.folder,
+                remedy="Name the folder of one recording, with one video of each camera.",
+            )  # fmt: skip
+        named[path.stem] = path
+    return named
 
 
 def _above(folder: Path) -> list[Path]:
@@ -259,7 +331,7 @@ def _calibration(draft: Draft, path: Path) -> Rig | None:
 def _up(rig: Rig | None) -> Value:
     if rig is not None and len(rig) > 1:
         return Value("z", "likely", "worlds of ROS are z up (REP 103)")
-    return Value("-y", "guess", "the world is the camera's frame, assumed level: y points down")
+    return Value("-y", "guess", _LEVEL_CAMERA)
 
 
 def _depth(draft: Draft, path: Path, topics: Sequence[Shown], rig: Rig | None) -> None:

@@ -147,7 +147,8 @@ def _mask_times(numbered: NamedFrames, rate: float, clock: NDArray | None) -> tu
     if numbered.numbers is None or not 0 <= numbered.numbers[0] <= numbered.numbers[-1] <= len(clock):
         return times, said
     first = 1 if numbered.numbers[0] == 1 or numbered.numbers[-1] == len(clock) else 0
-    return clock[numbered.numbers - first], f"masks of {len(times)} of the video's {len(clock)} frames, by their numbers"
+    shown = f"masks of {len(times)} of the video's {len(clock)} frames, by their numbers"
+    return clock[numbered.numbers - first], shown
 
 
 def _fitting_size(size: tuple[int, int], wanted: tuple[int, int], file: Path) -> tuple[int, int]:
@@ -202,9 +203,9 @@ class MaskCode:
         if share > _MAX_BODY_SHARE and np.median(borders) > _MAX_BODY_BORDER:
             what = "all but the background's value" if code.is_label or code.background is not None else "white"
             raise ObservationError(
-                f"{what} covers {100 * share:.0f} % of the masks and their border: inverted, or labels of all things in "
-                "the image", remedy="Make the body white and all else black. A body that fills the image looks the same.",
-            )  # fmt: skip
+                f"{what} covers {100 * share:.0f} % of the masks and their border: inverted, or labels of many things",
+                remedy="Make the body white and all else black. A body that fills the image looks the same.",
+            )
         return code
 
     def mask(self, image: NDArray) -> NDArray:
@@ -249,7 +250,7 @@ def _grey_code(values: NDArray) -> dict[str, Any]:
 def _colour_code(images: Sequence[NDArray]) -> dict[str, Any]:
     """How images (H, W, 3) of flat colours are to be read, as fields of `MaskCode`; refuses photographs."""
     pixels = np.concatenate([image.reshape(-1, 3) for image in images])
-    _, which, counts = np.unique(pixels // _COLOUR_BIN, axis=0, return_inverse=True, return_counts=True)
+    counts = np.unique(pixels // _COLOUR_BIN, axis=0, return_counts=True)[1]
     if counts[counts > _MIN_FLAT_SHARE * len(pixels) / 10].sum() < (1.0 - _MAX_GREY_SHARE) * len(pixels):
         problem = "images of many colours: photographs, or drawn over them, not masks"
         raise ObservationError(problem, remedy="Name the folder or pattern of the masks: white is the body.")
