@@ -308,7 +308,7 @@ def test_a_damaged_video_is_refused(small):
 def test_a_path_whose_backslashes_were_read_as_tabs_is_told(tmp_path):
     take = tmp_path / "take.toml"
     take.write_text('[calibration]\nfile = "C:\\temp\\new.toml"\n')
-    with pytest.raises(TakeError, match=r"forward slashes, or single quotes"):
+    with pytest.raises(TakeError, match=r"use forward slashes"):
         read_take(take)
 
 

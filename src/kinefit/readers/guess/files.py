@@ -104,7 +104,8 @@ def list_files(folder: Path) -> list[Path]:
         depth = len(Path(parent).relative_to(folder).parts)
         searched = folders if depth < _MAX_DEPTH else []
         folders[:] = [name for name in searched if not name.startswith(".") and not name.endswith(_RESULT_ENDINGS)]
-        found += [path for name in names if not name.startswith(".") and (path := Path(parent) / name).is_file()]
+        shown = [name for name in names if not name.startswith(".") or name.endswith(".icloud")]
+        found += [path for name in shown if (path := Path(parent) / name).is_file()]
     return sorted(found, key=lambda path: natural(str(path)))
 
 
