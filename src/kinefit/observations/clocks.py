@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from decimal import Decimal
@@ -25,7 +26,6 @@ _MIN_MOVE_PX = 20.0  # [px] of that distance is always allowed: some people have
 
 _NUMBER = re.compile(r"\d+")
 _DECIMAL = re.compile(r"(?:^|[_-])(\d+\.\d+)$")  # the end of a name; "shot.0001" is the frame 1 of a shot
-_UNIX = re.compile(r"(?<!\d)(\d{10})[._](\d{3,9})$")  # seconds and their fraction
 _UNIX_DIGITS = {13: 1e-3, 16: 1e-6, 19: 1e-9}  # [s] of a whole number of so many digits
 _MAX_UNIX_S = 2e9  # in 2033: dates of as many digits begin with 20
 _DATE = re.compile(
@@ -35,6 +35,7 @@ _STEPS_S = (0.0015, 10.0)  # median step of frames, so that decimals are seconds
 _COUNTED_UNITS = (1e-3, 1e-6, 1e-9)  # [s] of whole numbers that count from the start of a recording
 _MIN_COUNTED_STEP = 4  # numbers from one frame to the next, so that they may be milliseconds
 _MAX_RATE_ERROR = 0.05  # of a rate by such numbers, to the stated rate
+_MAX_COUNT = 2.0**53  # from the first number to the last: whole in 64 bits
 _MAX_NUMBER_STEP = 1.5  # of the numbers in two names, in median steps: with more a frame is missing
 
 
@@ -64,29 +65,22 @@ class NamedFrames:
 
     Parameters
     ----------
-    numbers : (N,) int or None
-        Of the frames; None where names have no number of their own.
+    file_names : (N,)
+    numbers : (N,) int
+        Of the frames; 0, 1, 2 where names have no number of their own.
     times : (N,) [s] or None
         By the names, on their own clock; None where they state none.
-    file_names : (N,)
     """
 
     file_names: tuple[str, ...]
-    numbers: NDArray | None = None
+    numbers: NDArray
     times: NDArray | None = None
 
     @property
     def step(self) -> int:
         """Most frequent step of the numbers: the lower median."""
-        steps = () if self.numbers is None else np.sort(np.diff(self.numbers))
+        steps = np.sort(np.diff(self.numbers))
         return int(steps[(len(steps) - 1) // 2]) if len(steps) else 1
-
-    @property
-    def gaps(self) -> NDArray:
-        """(G,) int: frames before which others are missing, by their numbers."""
-        if self.numbers is None:
-            return np.zeros(0, int)
-        return np.flatnonzero(np.diff(self.numbers) > _MAX_NUMBER_STEP * self.step) + 1
 
     def on_clock(self, rate: float, what: str = "files") -> tuple[NDArray, str]:
         """Times (N,) [s] of the frames from the first on, and what is worth saying of them; "" for even ones.
@@ -98,36 +92,26 @@ class NamedFrames:
         """
         if self.times is not None:
             return self.times - self.times[0], f"the names of its {what} are taken as their times"
-        count = len(self.file_names)
-        if self.numbers is None or count < 2:
-            return np.arange(count) / rate, ""
-        numbers, step = self.numbers - self.numbers[0], self.step
-        mean, between = float(numbers[-1]) / (count - 1), f"{self.file_names[0]} and {self.file_names[1]}"
+        count, step, numbers = len(self.file_names), self.step, self.numbers - self.numbers[0]
+        steps = f"the numbers of its {what} step by {step} ({', '.join(self.file_names[:2])}): "
         for unit in _COUNTED_UNITS if step >= _MIN_COUNTED_STEP else ():
             if abs(step * unit * rate - 1.0) < _MAX_RATE_ERROR:
-                said = f"the numbers of its {what} step by about {step} ({between}): taken as times in {unit:g} s, "
-                return numbers * unit, f"{said}{rate:.4g} Hz; frames of which others were left out look the same"
+                return numbers * unit, f"{steps}taken as times in {unit:g} s; frames that were left out look the same"
         if step / rate > _STEPS_S[1]:
-            said = f"the numbers of its {what} step by about {step} ({between}): not used, frames are even at "
-            return np.arange(count) / rate, f"{said}{rate:.4g} Hz. If they are times, write time_unit"
+            return np.arange(count) / rate, f"{steps}not used, frames are even. If they are times, write time_unit"
         if step > 1:
-            said = f"the numbers of its {what} step by {step} ({between}): taken as frames of {rate:.4g} Hz, of which "
-            said += f"every {_ordinal(step)} is there. If the {what} themselves have {rate:.4g} Hz, write "
-            return numbers / rate, f"{said}rate = {rate * mean:.4g}"
+            own = f"If the {what} themselves have {rate:.4g} Hz, write rate = {rate * step:.4g}"
+            return numbers / rate, f"{steps}taken as frames of {rate:.4g} Hz, of which one in {step} is there. {own}"
         missing = int(numbers[-1]) + 1 - count
-        at = self.file_names[self.gaps[0]] if len(self.gaps) else ""
-        said = f"{missing} numbers are missing among its {what}, the first before {at}: nothing is seen at their times"
-        return numbers / rate, said if missing else ""
+        return numbers / rate, f"{missing} numbers are missing among its {what}" if missing else ""
 
     def refuse_gaps(self, what: str) -> None:
         """Raise ObservationError where numbers of frames are missing between others."""
-        if len(self.gaps) and self.numbers is not None and self.times is None:
-            before, after = self.file_names[self.gaps[0] - 1], self.file_names[self.gaps[0]]
-            count = int(self.numbers[-1] - self.numbers[0]) // self.step + 1 - len(self.numbers)
-            raise ObservationError(
-                f"{what} are missing between {before} and {after}, {count} in all",
-                remedy="Copy them again, or remove all later ones, or number them without a gap.",
-            )
+        gaps = np.flatnonzero(np.diff(self.numbers) > _MAX_NUMBER_STEP * self.step)
+        if len(gaps) and self.times is None:
+            between = " and ".join(self.file_names[gaps[0] : gaps[0] + 2])
+            remedy = "Copy them again, or remove all later ones, or number them without a gap."
+            raise ObservationError(f"{what} are missing between {between}, in {len(gaps)} places", remedy=remedy)
 
 
 def counted_times(file_names: Sequence[str], unit: float) -> NDArray:
@@ -146,10 +130,6 @@ def counted_times(file_names: Sequence[str], unit: float) -> NDArray:
     return np.array([float(count - counts[0]) for count in counts]) * unit
 
 
-def _ordinal(number: int) -> str:
-    return {2: "second", 3: "third"}.get(number, f"{number}th")
-
-
 def frames_by_name(file_names: Sequence[str], what: str = "files") -> NamedFrames:
     """Frame numbers or times of a recording's files, from their names in natural order.
 
@@ -161,56 +141,39 @@ def frames_by_name(file_names: Sequence[str], what: str = "files") -> NamedFrame
     ObservationError
         Two files with one number.
     """
-    file_names = tuple(file_names)
+    plain = NamedFrames(tuple(file_names), np.arange(len(file_names)))
     stems = [PurePath(name).stem for name in file_names]
-    if len(stems) < 2:
-        return NamedFrames(file_names)
-    for read in (_seconds, _decimal_seconds):
-        found = [read(stem) for stem in stems]
-        times = np.array([time for time in found if time is not None])
-        if len(times) == len(stems) and (steps := np.diff(times)).min() > 0.0:
-            if _STEPS_S[0] < np.median(steps) < _STEPS_S[1]:
-                return NamedFrames(file_names, times=times)
     columns = [[int(number) for number in _NUMBER.findall(stem)] for stem in stems]
-    if not all(columns):
-        return NamedFrames(file_names)
+    if len(stems) < 2 or not all(columns):
+        return plain
+    times = np.array([_seconds(stem) for stem in stems], float)
+    if np.diff(times).min() > 0.0 and _STEPS_S[0] < np.median(np.diff(times)) < _STEPS_S[1]:
+        return replace(plain, times=times)
     alike = len({_NUMBER.sub("#", stem) for stem in stems}) == 1
     varying = [k for k in range(len(columns[0])) if len({row[k] for row in columns}) > 1] if alike else []
-    numbers = [row[varying[-1] if varying else -1] for row in columns]
-    if max(numbers) - min(numbers) > 2**53:
-        return NamedFrames(file_names)
-    steps = np.diff(np.array(numbers, float))
-    if (steps <= 0).any():
-        i = int(np.argmax(steps <= 0))
-        if len(set(numbers)) == len(numbers):
-            return NamedFrames(file_names)  # names that count in another way
-        raise ObservationError(
-            f"two {what} with one number: {file_names[i]} and {file_names[i + 1]}",
-            remedy='Name those of this camera by a pattern: "folder/left_*.png".',
-        )
-    return NamedFrames(file_names, np.array(numbers))
+    numbers = np.array([row[varying[-1] if varying else -1] for row in columns], float)
+    different, counts = np.unique(numbers, return_counts=True)
+    if len(different) < len(numbers):
+        twice = np.flatnonzero(numbers == different[np.argmax(counts)])[:2]
+        problem = f"two {what} with one number: {' and '.join(file_names[i] for i in twice)}"
+        remedy = 'Keep one camera in each folder, or name its files by a pattern: "folder/left_*.png".'
+        raise ObservationError(problem, remedy=remedy)
+    is_count = np.diff(numbers).min() > 0.0 and np.ptp(numbers) < _MAX_COUNT
+    return replace(plain, numbers=numbers.astype(int)) if is_count else plain
 
 
-def _seconds(stem: str) -> float | None:
-    """Seconds since 1970 that a name states, by their number or a date; None without."""
-    if unix := _UNIX.search(stem):
-        return float(f"{unix[1]}.{unix[2]}")
-    last = _NUMBER.findall(stem)
-    unit = _UNIX_DIGITS.get(len(last[-1])) if last else None
-    if unit is not None and _MAX_UNIX_S / 2.0 < int(last[-1]) * unit < _MAX_UNIX_S:
-        return int(last[-1]) * unit
-    if date := _DATE.search(stem):
-        try:
+def _seconds(stem: str) -> float:
+    """Seconds that a name states: a decimal number, seconds since 1970 or a date; NaN without."""
+    if decimal := _DECIMAL.search(stem):
+        return float(decimal[1])
+    last = _NUMBER.findall(stem)[-1]
+    time = int(last) * _UNIX_DIGITS.get(len(last), 0.0)
+    if _MAX_UNIX_S / 2.0 < time < _MAX_UNIX_S:
+        return time
+    with suppress(ValueError):
+        if date := _DATE.search(stem):
             return datetime.strptime("".join(date.groups()) + "+0000", "%Y%m%d%H%M%S%f%z").timestamp()
-        except ValueError:
-            return None
-    return None
-
-
-def _decimal_seconds(stem: str) -> float | None:
-    """Decimal number at the end of a name; None without."""
-    found = _DECIMAL.search(stem)
-    return float(found[1]) if found else None
+    return np.nan
 
 
 def unevenness(times: NDArray, rate: float) -> str:

@@ -37,7 +37,9 @@ _MIN_FLAT_SHARE = 0.02  # of the pixels that are not 0, in values that are label
 _MAX_COLOUR_ERROR = 24  # of 255, of a compressed colour
 _MAX_STRAY_SHARE = 0.005  # of the pixels: soft edges and compression
 _MAX_GREY_SHARE = 0.25  # of the pixels, in masks with wide soft edges
+_MIN_COLOUR_SHARE = 0.002  # of the pixels, in a flat colour
 _COLOUR_BIN = 32
+_NAME_MASKS = "Name the folder or pattern of the masks: white is the body."
 _PICTURES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
 _Level = Annotated[int, Meta(ge=0, le=255, description="Give [r, g, b], 0 to 255 each.")]
 
@@ -140,15 +142,12 @@ def _sampled(files: Sequence[Path]) -> list[NDArray]:
 def _mask_times(numbered: NamedFrames, rate: float, clock: NDArray | None) -> tuple[NDArray, str]:
     """Times (N,) [s] of masks from the video's first frame on, and what is worth saying of them."""
     times, said = numbered.on_clock(rate, "masks")
-    if clock is None or numbered.times is not None:
+    if clock is None or numbered.times is not None or numbered.numbers[-1] > len(clock):
         return times, said
     if len(clock) == len(times):
         return clock, ""
-    if numbered.numbers is None or not 0 <= numbered.numbers[0] <= numbered.numbers[-1] <= len(clock):
-        return times, said
     first = 1 if numbered.numbers[0] == 1 or numbered.numbers[-1] == len(clock) else 0
-    shown = f"masks of {len(times)} of the video's {len(clock)} frames, by their numbers"
-    return clock[numbered.numbers - first], shown
+    return clock[numbered.numbers - first], f"{len(times)} masks of the video's {len(clock)} frames, by their numbers"
 
 
 def _fitting_size(size: tuple[int, int], wanted: tuple[int, int], file: Path) -> tuple[int, int]:
@@ -167,15 +166,15 @@ class MaskCode:
     ----------
     size : (width, height) [px] of the images
     by_alpha : whether the alpha channel is the mask
-    background : (3,) colour of the background of images of flat colours; None: grey values are the mask
-    is_label : whether all but 0 is the body; else white is
+    background : colour or value of the background, of images in which all else is the body; None: white is the body
+    tolerance : difference of a channel from the background, above which it is the body
     note : what is worth saying
     """
 
     size: tuple[int, int]
     by_alpha: bool = False
     background: NDArray | None = None
-    is_label: bool = False
+    tolerance: int = 0
     note: str = ""
 
     @classmethod
@@ -187,21 +186,20 @@ class MaskCode:
         ObservationError
             Photographs; labels of the whole image; masks in which the body is black.
         """
-        size = images[0].shape[1::-1]
         by_alpha = any(image.ndim == 3 and image.shape[2] == 4 and np.ptp(image[..., 3]) > 0 for image in images)
-        code = cls(size, by_alpha)
-        grey = [code._grey(image) for image in images]
-        if by_alpha or all(one is not None for one in grey):
-            values = np.concatenate([one.ravel() for one in grey if one is not None])
-            code = replace(code, **_grey_code(values))
+        code = cls(images[0].shape[1::-1], by_alpha)
+        values = [code._values(image) for image in images]
+        pixels = np.concatenate([image.reshape(len(image) * image.shape[1], -1).max(axis=1) for image in values])
+        if any(np.mean(np.ptp(image.astype(int), axis=2) > _MAX_COLOUR_ERROR) > _MAX_STRAY_SHARE for image in values):
+            code = replace(code, **_colour_code(values))
+        elif pixels.dtype != np.uint8 or pixels.max(initial=0) <= 1:
+            code = replace(code, background=np.zeros(1, int))
         else:
-            code = replace(code, **_colour_code([image[..., :3] for image in images]))
-        masks = [code.mask(image) > _WHITE for image in images]
-        masks = [mask for mask in masks if mask.any()]
-        borders = [np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean() for mask in masks]
+            code = replace(code, **_grey_code(pixels))
+        masks = [mask for mask in (code.mask(image) > _WHITE for image in images) if mask.any()]
         share = float(np.median([mask.mean() for mask in masks] or [0.0]))
-        if share > _MAX_BODY_SHARE and np.median(borders) > _MAX_BODY_BORDER:
-            what = "all but the background's value" if code.is_label or code.background is not None else "white"
+        if share > _MAX_BODY_SHARE and np.median([_border(mask).mean() for mask in masks]) > _MAX_BODY_BORDER:
+            what = "white" if code.background is None else "all but the background's value"
             raise ObservationError(
                 f"{what} covers {100 * share:.0f} % of the masks and their border: inverted, or labels of many things",
                 remedy="Make the body white and all else black. A body that fills the image looks the same.",
@@ -210,40 +208,36 @@ class MaskCode:
 
     def mask(self, image: NDArray) -> NDArray:
         """(H, W) uint8, 255 for the body, of an image as stored."""
-        if self.background is not None:
-            image = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image[..., :3]
-            apart = np.abs(image.astype(int) - self.background).max(axis=2) > _MAX_COLOUR_ERROR
-            return np.where(apart, 255, 0).astype(np.uint8)
-        grey = self._grey(image)
-        if grey is None:
-            grey = image[..., :3].max(axis=2)
-        if self.is_label or grey.dtype != np.uint8:
-            return np.where(grey > 0, 255, 0).astype(np.uint8)
-        return grey
+        values = self._values(image)
+        if self.background is None:
+            return values.max(axis=2)
+        apart = np.abs(values.astype(float) - self.background).max(axis=2) > self.tolerance
+        return np.where(apart, 255, 0).astype(np.uint8)
 
-    def _grey(self, image: NDArray) -> NDArray | None:
-        """(H, W) of an image without colours, or its alpha channel where that is the mask; None of a coloured one."""
+    def _values(self, image: NDArray) -> NDArray:
+        """(H, W, 1 or 3) of an image: grey, colours, or its alpha channel where that is the mask."""
         if image.ndim == 2:
-            return image
-        if self.by_alpha:
-            return image[..., 3] if image.shape[2] == 4 else image[..., :3].max(axis=2)
-        coloured = np.ptp(image[..., :3].astype(int), axis=2) > _MAX_COLOUR_ERROR
-        return None if coloured.mean() > _MAX_STRAY_SHARE else image[..., :3].max(axis=2)
+            return image[..., None]
+        return image[..., 3:] if self.by_alpha and image.shape[2] == 4 else image[..., :3]
+
+
+def _border(image: NDArray) -> NDArray:
+    """The pixels of an image's four edges, (N) or (N, channels)."""
+    return np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
 
 
 def _grey_code(values: NDArray) -> dict[str, Any]:
-    """How grey values (N,) of masks are to be read, as fields of `MaskCode`."""
+    """How grey values (N,) uint8 of masks are to be read, as fields of `MaskCode`; refuses photographs."""
     found, counts = np.unique(values[values > 0], return_counts=True)
     flat = found[counts > _MIN_FLAT_SHARE * counts.sum()]
-    if not len(found) or found[-1] <= 1 or values.dtype != np.uint8 or flat.tolist() == [255]:
-        return {"is_label": bool(len(found)) and (found[-1] <= 1 or values.dtype != np.uint8)}
-    if flat.size and flat[0] < 255 - _MAX_COLOUR_ERROR and np.isin(values, [0, *flat]).mean() > 1.0 - _MAX_STRAY_SHARE:
+    on_flat = float(np.isin(values, [0, *flat]).mean())
+    if flat.size and flat[0] < 255 - _MAX_COLOUR_ERROR and on_flat > 1.0 - _MAX_STRAY_SHARE:
         listed = ", ".join(str(value) for value in flat[:8])
-        return {"is_label": True, "note": f"images of the values 0 and {listed}: all but 0 is taken as the body"}
-    levels = (values > _MAX_COLOUR_ERROR) & (values < 255 - _MAX_COLOUR_ERROR)
-    if levels.mean() > _MAX_GREY_SHARE:
-        problem = f"images of many grey values, in {100 * levels.mean():.0f} % of their pixels, are not masks"
-        raise ObservationError(problem, remedy="Name the folder or pattern of the masks: white is the body.")
+        note = f"images of the values 0 and {listed}: all but 0 is taken as the body"
+        return {"background": np.zeros(1, int), "note": note}
+    levels = float(np.mean((values > _MAX_COLOUR_ERROR) & (values < 255 - _MAX_COLOUR_ERROR)))
+    if levels > _MAX_GREY_SHARE:
+        raise ObservationError(f"images of many grey values, in {100 * levels:.0f} % of the pixels", remedy=_NAME_MASKS)
     return {}
 
 
@@ -251,17 +245,12 @@ def _colour_code(images: Sequence[NDArray]) -> dict[str, Any]:
     """How images (H, W, 3) of flat colours are to be read, as fields of `MaskCode`; refuses photographs."""
     pixels = np.concatenate([image.reshape(-1, 3) for image in images])
     counts = np.unique(pixels // _COLOUR_BIN, axis=0, return_counts=True)[1]
-    if counts[counts > _MIN_FLAT_SHARE * len(pixels) / 10].sum() < (1.0 - _MAX_GREY_SHARE) * len(pixels):
-        problem = "images of many colours: photographs, or drawn over them, not masks"
-        raise ObservationError(problem, remedy="Name the folder or pattern of the masks: white is the body.")
-    edges = [np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]) for image in images]
-    colours, counts = np.unique(np.concatenate(edges), axis=0, return_counts=True)
+    if counts[counts > _MIN_COLOUR_SHARE * len(pixels)].sum() < (1.0 - _MAX_GREY_SHARE) * len(pixels):
+        raise ObservationError("images of many colours: photographs, or drawn over them", remedy=_NAME_MASKS)
+    colours, counts = np.unique(np.concatenate([_border(image) for image in images]), axis=0, return_counts=True)
     background = colours[np.argmax(counts)].astype(int)
-    if not pixels[np.abs(pixels - background).max(axis=1) > _MAX_COLOUR_ERROR].size:
-        return {}
-    red, green, blue = background[::-1]
-    note = f"coloured images: all but the colour of their border ({red}, {green}, {blue}) is taken as the body"
-    return {"background": background, "note": note}
+    note = f"coloured images: all but the colour of their border, {background[::-1].tolist()}, is taken as the body"
+    return {"background": background, "tolerance": _MAX_COLOUR_ERROR, "note": note}
 
 
 def _silhouettes(entry: SilhouetteEntry, cameras: TakeCameras) -> SilhouetteVideo:
