@@ -8,19 +8,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.findings import Edit, Finding
+from kinefit.findings import Finding
 from kinefit.images.depth_scene import background_model, foreground
 from kinefit.observations import DepthVideo
-from kinefit.readers.take.entries import DepthEntry
 from kinefit.readers.take.file import Take
 
 _MAX_IMAGES = 16  # of a recording, spread over it
 _MIN_BLOB_SHARE = 0.01  # of the image that moves before the background
 _MAX_PERSON_EXTENT = 2.7  # [m] of what moves: a person with an arm stretched upwards has 2.6
 _TYPICAL_EXTENT = 1.7  # [m]
-_UNITS = (0.0001, 0.000125, 0.0002, 0.00025, 0.0005, 0.001)  # [m] of one count, of sensors and data sets
-_MAX_UNIT_ERROR = 1.35  # of a person's extent to the typical one, either way
 _MAX_CENTRE_OFFSET = 0.15  # of the image's side, of the principal point: of depth cameras below 0.06
+_MIN_PLANE_POINTS = 500
 _PLANE_SAMPLES = 300
 _PLANE_ERROR = 0.006  # of the distance, of points on a plane
 _MIN_PLANE_SHARE = 0.25  # of the image, on its largest plane
@@ -35,89 +33,77 @@ UNCHECKED = (
 
 def depth_findings(take: Take, videos: Sequence[DepthVideo]) -> list[Finding]:
     """Findings on units, principal points and distances along rays of a take's depth cameras."""
-    out = []
-    for entry in take.depth:
-        for video in (video for video in videos if video.sensor == entry.name and video.camera is not None):
+    out, units = list[Finding](), {entry.name: entry.unit or 0.001 for entry in take.depth}
+    for video in videos:
+        if video.camera is not None and video.sensor in units:
             sample = np.unique(np.linspace(0, len(video) - 1, _MAX_IMAGES, dtype=int))
             images = [video.frame(int(i)).depth for i in sample]
-            found = (_unit(entry, video, images), _centre(entry, video), _along_rays(entry, video, images[0]))
-            out += [finding for finding in found if finding is not None]
+            out += _unit(video, images, units[video.sensor]) + _centre(video) + _along_rays(video, images[0])
     return out
 
 
 def moving_extent(video: DepthVideo, images: Sequence[NDArray]) -> float | None:
     """Largest side [m] of the box of what moves before the background, median of images (H, W) [m]; None if unclear."""
-    camera = video.camera
-    assert camera is not None
-    background = np.zeros_like(images[0])
-    if not video.on_body:
-        empty = images if video.background is None else [video.background.frame(0).depth]
-        background = background_model(empty, share=0.2 if video.background is None else 0.5)
+    assert video.camera is not None
+    empty = images if video.background is None else [video.background.frame(0).depth]
+    background = background_model(empty, share=0.2 if video.background is None else 0.5)
     extents = []
     for depth in images:
-        moves = foreground(depth, background) & ((background > 0.0) | video.on_body)
+        moves = depth > 0.0 if video.on_body else foreground(depth, background) & (background > 0.0)
         labels, stats = cv2.connectedComponentsWithStats(moves.astype(np.uint8), connectivity=4)[1:3]
-        blob = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])) if len(stats) > 1 else 0
+        blob = int(np.argmax(stats[:, cv2.CC_STAT_AREA] * (np.arange(len(stats)) > 0)))
         if blob and stats[blob, cv2.CC_STAT_AREA] > _MIN_BLOB_SHARE * depth.size:
-            z = float(np.median(depth[labels == blob]))
-            width, height = stats[blob, cv2.CC_STAT_WIDTH], stats[blob, cv2.CC_STAT_HEIGHT]
-            extents.append(z * max(width / camera.matrix[0, 0], height / camera.matrix[1, 1]))
+            sides = stats[blob, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]] / np.diag(video.camera.matrix)[:2]
+            extents.append(float(np.median(depth[labels == blob]) * sides.max()))
     return float(np.median(extents)) if 2 * len(extents) >= len(images) else None
 
 
-def _unit(entry: DepthEntry, video: DepthVideo, images: Sequence[NDArray]) -> Finding | None:
+def _unit(video: DepthVideo, images: Sequence[NDArray], unit: float) -> list[Finding]:
     """A moving thing that is too large to be a person."""
-    extent = moving_extent(video, images) if len(images) > 2 or video.on_body else None
+    extent = moving_extent(video, images)
     if extent is None or extent < _MAX_PERSON_EXTENT:
-        return None
-    unit = entry.unit or 0.001
-    factors = {other: extent * other / unit / _TYPICAL_EXTENT for other in _UNITS if other < unit}
-    fitting = [other for other, ratio in factors.items() if 1.0 / _MAX_UNIT_ERROR < ratio < _MAX_UNIT_ERROR]
-    best = min(fitting, key=lambda other: abs(np.log(factors[other])), default=None)
-    text = f"What moves before {entry.name} is {extent:.3g} m large in most images: a person is smaller."
-    remedy = f"If its counts are no millimetres, write unit = ... [m]{f'; {best:g} fits a person' if best else ''}."
-    edits = (Edit("depth", "unit", f"{best:g}", entry.name),) if best and entry.unit is None else ()
+        return []
+    text = f"What moves before {video.sensor} is {extent:.3g} m large in most images: a person is smaller."
+    remedy = f"Write its unit [m of a count]: about {unit * _TYPICAL_EXTENT / extent:.1g} would fit a person."
     sure = "A guess: focal lengths that are too short, several people side by side and a vehicle look the same."
-    return Finding("doubt", "unit", text, (entry.name,), sure, remedy, edits)
+    return [Finding("doubt", "unit", text, (video.sensor,), sure, remedy)]
 
 
-def _centre(entry: DepthEntry, video: DepthVideo) -> Finding | None:
+def _centre(video: DepthVideo) -> list[Finding]:
     """A principal point far from the middle of the image."""
     assert video.camera is not None
-    K, size = video.camera.matrix, np.array(video.size)
-    off = (K[:2, 2] - (size - 1) / 2.0) / size
-    if np.abs(off).max() < _MAX_CENTRE_OFFSET:
-        return None
-    text = f"{entry.name}: the principal point ({K[0, 2]:.4g}, {K[1, 2]:.4g}) is {100 * np.abs(off).max():.0f} %"
-    text += f" of the side off the middle of its {size[0]}x{size[1]} px image."
+    centre, size = video.camera.matrix[:2, 2], np.array(video.size)
+    off = float(np.abs((centre - (size - 1) / 2.0) / size).max())
+    if off < _MAX_CENTRE_OFFSET:
+        return []
+    text = f"The principal point of {video.sensor}, {centre[0]:.4g}, {centre[1]:.4g}, is {100 * off:.0f} % of the image "
     remedy = "Give the intrinsics of the depth stream at this size, not those of the colour stream."
     sure = "A guess: an image that was cropped on one side looks the same."
-    return Finding("doubt", "intrinsics", text, (entry.name,), sure, remedy)
+    return [Finding("doubt", "intrinsics", f"{text}off its middle.", (video.sensor,), sure, remedy)]
 
 
-def _along_rays(entry: DepthEntry, video: DepthVideo, depth: NDArray) -> Finding | None:
+def _along_rays(video: DepthVideo, depth: NDArray) -> list[Finding]:
     """Distances along the rays, given as depth: walls and floors are curved."""
-    camera = video.camera
-    assert camera is not None
+    assert video.camera is not None
     step = max(int(np.sqrt(depth.size / 5000)), 1)
-    z, table = depth[::step, ::step].ravel(), camera.ray_table[:, ::step, ::step].reshape(2, -1)
+    z, table = depth[::step, ::step].ravel(), video.camera.ray_table[:, ::step, ::step].reshape(2, -1)
     known = (z > 0.0) & np.isfinite(table).all(axis=0)
-    rays, z = np.column_stack([*table[:, known], np.ones(known.sum())]), z[known]
-    if len(z) < 500:
-        return None
-    points = rays * z[:, None]
+    rays = np.column_stack([*table[:, known], np.ones(known.sum())])
+    points = rays * z[known, None]
     shares = [_plane_share(x) for x in (points, points / np.linalg.norm(rays, axis=1)[:, None])]
-    if shares[1] < _MIN_PLANE_SHARE or shares[1] < _MIN_PLANE_GAIN * shares[0]:
-        return None
-    text = f"{entry.name}: the largest plane in view is curved by its depths ({100 * shares[0]:.0f} % of the points "
-    text += f"lie on one plane), and flat if they are distances along the rays ({100 * shares[1]:.0f} %)."
+    if shares[1] < max(_MIN_PLANE_SHARE, _MIN_PLANE_GAIN * shares[0]):
+        return []
+    on_plane = f"{100 * shares[0]:.0f} and {100 * shares[1]:.0f} % of the points lie on it"
+    text = f"A wall before {video.sensor} is curved by its depths, and flat if they are distances along rays ({on_plane})."
     remedy = "Convert them: depth = distance / |ray|, with ray = ((u - cx) / fx, (v - cy) / fy, 1)."
     sure = "A guess: wrong distortion of the lens and a round room look the same."
-    return Finding("doubt", "radial", text, (entry.name,), sure, remedy)
+    return [Finding("doubt", "radial", text, (video.sensor,), sure, remedy)]
 
 
 def _plane_share(x: NDArray) -> float:
     """Share of points (N, 3) [m] on their largest plane, by random triples."""
+    if len(x) < _MIN_PLANE_POINTS:
+        return 0.0
     rng = np.random.default_rng(0)
     a, b, c = x[rng.integers(0, len(x), (3, _PLANE_SAMPLES))]
     normals = np.cross(b - a, c - a)

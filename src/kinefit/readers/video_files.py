@@ -51,9 +51,9 @@ class VideoFile:
         self.note = ""
         captured = _capture_rate(self._container)
         if captured is not None and abs(captured / self.rate - 1.0) > _MAX_CAPTURE_ERROR:
+            stated = f"captured at {captured:.6g} Hz as the file states ({_CAPTURE_RATE}), stored at {self.rate:.6g} Hz"
             kind = "slow motion" if captured > self.rate else "time lapse"
-            self.note = f"{kind}: captured at {captured:.6g} Hz as the file states ({_CAPTURE_RATE}), stored at "
-            self.note += f"{self.rate:.6g} Hz; times are those of the capture"
+            self.note = f"{kind}: {stated}; times are those of the capture"
             self.times, self.rate = self.times * (self.rate / captured), captured
         self._restart()
 

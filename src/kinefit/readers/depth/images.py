@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import npy_header, read_npz, regular
+from kinefit._files import read_npy, read_npz, regular
 from kinefit._pictures import page_sizes, read_page, read_picture
 from kinefit.errors import FileError, ObservationError, names_file
 from kinefit.geometry.camera import Camera
@@ -174,12 +174,10 @@ def _raw_type(file: Path, pixels: int, unit: float | None) -> tuple[str, str]:
         data = stream.read(4 * pixels)
     if file.stat().st_size == 4 * pixels and _is_metres(np.frombuffer(data, "<f4")):
         return "<f4", "raw files of 4 bytes a pixel, read as float32 in metres; two 16-bit images look the same"
-    whole = data[: len(data) // 2 * 2]
-    counts = np.frombuffer(whole, "<u2")
-    far = np.median(counts[counts > 0]) * 0.001 > _MAX_PERSON_DISTANCE if counts.any() else False
-    if unit is None and far and _is_metres(np.frombuffer(whole, "<f2")):
-        said = "raw 16-bit files, read as float16 in metres; counts of "
-        return "<f2", f"{said}{counts[counts > 0].min()} to {counts.max()} look the same: write unit if they are counts"
+    counts = np.frombuffer(data[: len(data) // 2 * 2], "<u2")
+    is_far = counts.any() and np.median(counts[counts > 0]) * 0.001 > _MAX_PERSON_DISTANCE
+    if unit is None and is_far and _is_metres(counts.view("<f2")):
+        return "<f2", "raw 16-bit files, read as float16 in metres; for counts that look the same write unit"
     return "<u2", ""
 
 
@@ -195,22 +193,22 @@ def npy_source(files: list[Path]) -> DepthSource:
 
     Raises
     ------
+    FileError
+        Damaged, or no array of numbers.
     ObservationError
         An array of another shape or type.
     """
+    remedy = "Give an image (height, width) a file, or an archive .npz with `depth` (frames, height, width)."
+
     def image(file: Path) -> NDArray:
-        header = npy_header(file)
-        if header is None or header[1].kind not in "uif" or len(header[0]) != (2 if len(files) > 1 else len(header[0])):
-            remedy = "Give an image (height, width) a file, or an archive .npz with `depth` (frames, height, width)."
-            raise ObservationError("no array of a depth image", file=file, remedy=remedy)
-        return np.asarray(np.load(file, allow_pickle=False, mmap_mode="r"))
+        array = read_npy(file, remedy=remedy)
+        if array.ndim not in ((2,) if len(files) > 1 else (2, 3)) or not array.size or array.dtype.kind not in "uif":
+            raise ObservationError(f"an array of shape {array.shape} of {array.dtype}", file=file, remedy=remedy)
+        return array
 
     first = image(files[0])
-    if first.ndim not in (2, 3) or not first.size:
-        remedy = "Give (height, width), or (frames, height, width)."
-        raise ObservationError(f"an array of shape {first.shape}, no depth images", file=files[0], remedy=remedy)
     unit = 1.0 if first.dtype.kind == "f" else 0.001
-    if len(files) == 1 and first.ndim == 3:
+    if first.ndim == 3:
         return DepthSource(len(first), lambda i: counts_of(first[i]), first.shape[:0:-1], unit)
     names = tuple(file.name for file in files)
     return DepthSource(len(files), lambda i: counts_of(image(files[i])), first.shape[::-1], unit, names=names)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import builtins
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -40,6 +40,7 @@ _MAX_MEDIAN_DEPTH = 30.0  # [m] no sensor shows a person farther away
 _PERSON_DISTANCES = (0.4, 6.0)  # [m] typical range in front of a depth sensor
 _COUNT_UNITS = (1.0, 0.001, 0.01, 0.000125, 0.0001, 0.0002, 0.00025)  # [m] of sensors and data sets
 _DEFAULT_RATE = 30.0  # [Hz] of nearly every depth camera
+_TUM_LISTS = ("depth.txt", "associations.txt", "associate.txt", "assoc.txt")
 _MIN_SHARE_OF_EIGHT = 0.6  # of the different counts: by chance an eighth
 _MIN_DIFFERENT_COUNTS = 15  # of an image, so that their multiples are no chance
 _MAX_ROUGHNESS = 0.1  # of a depth: median difference of neighbouring pixels; of depth cameras below 0.02
@@ -208,37 +209,27 @@ def _unit_of_counts(path: Path, source: DepthSource) -> tuple[float, str]:
     for the number of a person: most counts are multiples of eight.
     """
     counts = [np.asarray(source.image(k)) for k in sorted({0, source.count // 2, source.count - 1})]
-    values = np.concatenate([image[(image > 0) & np.isfinite(image)] for image in counts])
-    if not len(values) or any(image.dtype.kind == "f" and (image % 1 != 0).any() for image in counts):
+    values = np.unique(np.concatenate([image[(image > 0) & np.isfinite(image)] for image in counts]))
+    if not len(values) or (values % 1 != 0).any():
         return 0.001, ""
-    median = float(np.median(values))
-    listed_beside = next((f for f in (path.parent, path) for f in _tum_lists(f)), None)
-    if listed_beside is not None:
-        said = f"{listed_beside.name} is a list of a TUM RGB-D folder, so 5000 counts are taken as a metre:"
-        said += f" unit = 0.0002, a median of {0.0002 * median:.3g} m"
-        return 0.0002, f"{said}. Counts of millimetres would be unit = 0.001"
+    if any(_is_tum_list(folder / name) for folder in (path.parent, path) for name in _TUM_LISTS):
+        return 0.0002, "a list of a TUM RGB-D folder lies beside: unit = 0.0002 is taken; millimetres would be 0.001"
+    median = float(np.median(np.concatenate([image[image > 0] for image in counts])))
     if 0.001 * median <= _PERSON_DISTANCES[1]:
         return 0.001, ""
-    different = np.unique(values)
-    of_eight = float(np.mean(different % 8 == 0)) if len(different) > _MIN_DIFFERENT_COUNTS else 0.0
+    of_eight = float(np.mean(values % 8 == 0)) if len(values) > _MIN_DIFFERENT_COUNTS else 0.0
     if of_eight > _MIN_SHARE_OF_EIGHT and _PERSON_DISTANCES[0] < 0.000125 * median < _PERSON_DISTANCES[1]:
-        said = f"{100 * of_eight:.0f} % of its different counts are multiples of 8, as those of first Kinects with a"
-        said += " person's number in three bits: taken as unit = 0.000125"
-        return 0.000125, f"{said}. Depth in steps of 8 mm would be unit = 0.001"
+        said = f"{100 * of_eight:.0f} % of its counts are multiples of 8, as of first Kinects with a person's number in"
+        return 0.000125, f"{said} three bits: unit = 0.000125 is taken; depth in steps of 8 mm would be 0.001"
     likely = [u for u in _COUNT_UNITS if u < 0.001 and _PERSON_DISTANCES[0] < median * u < _PERSON_DISTANCES[1]]
-    units = ", ".join(f"{unit:g} ({unit * median:.2g} m)" for unit in likely)
-    said = f"no file states the unit of its counts: as millimetres the median depth is {0.001 * median:.3g} m, farther "
-    said += "than a depth camera sees people well. A hall looks the same; else write unit = "
-    return 0.001, said + (units or "...")
+    said = f"no file states the unit: as millimetres its median is {0.001 * median:.3g} m, farther than depth cameras"
+    return 0.001, f"{said} see well. A hall looks so; else write unit = {' or '.join(f'{u:g}' for u in likely) or '...'}"
 
 
-def _tum_lists(folder: Path) -> Iterator[Path]:
-    """Lists of depth images in the TUM RGB-D convention."""
-    for name in ("depth.txt", "associations.txt", "associate.txt", "assoc.txt"):
-        if (file := folder / name).is_file():
-            rows = read_text(file, "it", remedy="", errors="replace")[:4000].splitlines()
-            if any(re.match(r"\s*\d+\.\d+\s+\S*depth\S*\.png|.*\s\d+\.\d+\s+\S*depth\S*\.png", row) for row in rows):
-                yield file
+def _is_tum_list(file: Path) -> bool:
+    """Whether a file lists depth images with their times, as TUM RGB-D folders do."""
+    rows = read_text(file, "it", remedy="", errors="replace")[:4000] if file.is_file() else ""
+    return re.search(r"\d+\.\d+[ \t]+\S*depth\S*\.png", rows) is not None
 
 
 def _of_ending(files: list[Path], endings: tuple[str, ...]) -> list[Path]:

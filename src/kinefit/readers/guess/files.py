@@ -19,10 +19,8 @@ from kinefit._files import npy_header, read_table
 from kinefit._pictures import read_picture
 from kinefit.errors import CalibrationError, FileError, KinefitError
 from kinefit.geometry.camera import Rig
-from kinefit.observations.videos import DepthVideo
 from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, read_calibration
 from kinefit.readers.depth.images import PICTURES, depth_picture, natural
-from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.depth.streams import depth_tracks
 from kinefit.readers.guess.names import camera_of
 from kinefit.readers.keypoint_sets import SPLIT, other_keypoints
@@ -275,68 +273,43 @@ def _is_photograph(grey: NDArray) -> bool:
     return float(np.mean((grey > _MASK_TOLERANCE) & (grey < 255 - _MASK_TOLERANCE))) > _MIN_GREY_SHARE
 
 
-@dataclass(frozen=True)
-class FoundDepth:
-    """Depth among files: folders or patterns of images, and tracks of videos; and why others cannot be used."""
-
-    usable: dict[Path, DepthVideo]
-    unusable: dict[Path, str]
-
-
-def find_depth(files: Sequence[Path]) -> FoundDepth:
-    """Folders (or patterns) of depth images, one a frame, and videos with a depth track."""
-    places: list[Path] = []
-    usable: dict[Path, DepthVideo] = {}
-    unusable: dict[Path, str] = {}
+def find_depth(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Depth among files: folders or patterns of images and videos with a depth track; images that are alone."""
+    found, single = [path for path in files if path.suffix.lower() in _WITH_DEPTH and depth_tracks(path)], list[Path]()
     for folder, group in _by_folder(list(files)):
         series: dict[str, list[Path]] = {}
-        for path in group:
-            if path.suffix.lower() in (*PICTURES, ".npy"):
-                series.setdefault(re.sub(r"\d+", "*", path.name), []).append(path)
-        for pattern, images in series.items():
-            whole = len(images) == sum(len(other) for other in series.values())
-            place = folder if whole else folder / re.sub(r"\*.*\*", "*", pattern)
-            if not _is_depth(images[0]):
-                continue
+        for path in (path for path in group if path.suffix.lower() in (*PICTURES, ".npy")):
+            series.setdefault(re.sub(r"\d+", "*", path.name), []).append(path)
+        for pattern, images in ((pattern, images) for pattern, images in series.items() if _is_depth(images[0])):
             if len(images) > 1:
-                places.append(place)
+                found.append(folder if len(series) == 1 else folder / re.sub(r"\*.*\*", "*", pattern))
             else:
-                unusable[images[0]] = "one depth image, not a recording; track it with [[depth]] of this file"
-    for path in (*places, *(p for p in files if p.suffix.lower() in _WITH_DEPTH and depth_tracks(p))):
-        try:
-            usable[path] = read_depth(path)
-        except KinefitError as error:
-            unusable[path] = f"its depth cannot be used: {error.problem}. {error.remedy or ''}".strip()
-    return FoundDepth(usable, unusable)
+                single += images
+    return found, single
 
 
 def _is_depth(image: Path) -> bool:
-    """Whether an image has one channel of 16 bits or float, with the values of a depth in millimetres or metres."""
+    """Whether an image has one channel of 16 bits or float, and many values, as a mask has not."""
     if image.suffix.lower() == ".npy":
-        header = npy_header(image)
-        if header is None or len(header[0]) != 2 or min(header[0]) < _MIN_DEPTH_SIDE or header[1].kind not in "uf":
-            return False
-        return header[1].itemsize > 1
+        shape, kind = npy_header(image) or ((), np.dtype(bool))
+        return len(shape) == 2 and min(shape) >= _MIN_DEPTH_SIDE and kind.kind in "uf" and kind.itemsize > 1
     try:
-        pixels = depth_picture(image)
+        return len(np.unique(depth_picture(image)[::4])) > _MIN_DEPTH_VALUES
     except KinefitError:
         return False
-    known = pixels[(pixels > 0) & np.isfinite(pixels) & (pixels < 65535)]
-    return bool(len(np.unique(known[:10_000])) > _MIN_DEPTH_VALUES)
 
 
-def unreadable(path: Path) -> str:
+_STAND_INS = {
+    (".zip", ".7z", ".rar", ".tar", ".tgz", ".tar.gz"): "an archive: unpack it, and run kinefit init again",
+    (".icloud",): "a placeholder of iCloud, the file itself is not here: download it (open it in Finder)",
+    (".crdownload", ".part", ".download"): "a download that is not finished: download it again",
+    (".360", ".insv"): "a 360° video of two fisheye images: export a flat view of it with the maker's program",
+}
+
+
+def stand_in(path: Path) -> str:
     """What a file is that stands in place of a recording, and what to do; "" for others."""
-    name = path.name.lower()
-    if name.endswith((".zip", ".7z", ".rar", ".tar", ".tar.gz", ".tgz")):
-        return "an archive: unpack it, and run kinefit init again"
-    if name.endswith(".icloud"):
-        return "a placeholder of iCloud, the file itself is not here: download it (open it in Finder)"
-    if name.endswith((".crdownload", ".part", ".download")):
-        return "a download that is not finished: download it again"
-    if name.endswith((".360", ".insv")):
-        return "a 360° video of two fisheye images: export a flat view of each camera with the maker's program"
-    return ""
+    return next((text for endings, text in _STAND_INS.items() if path.name.lower().endswith(endings)), "")
 
 
 def find_markers(files: list[Path]) -> list[Path]:

@@ -11,6 +11,8 @@ import numpy as np
 
 from kinefit.errors import CalibrationError, KinefitError, PluginError, TakeError, command
 from kinefit.geometry.camera import Rig
+from kinefit.observations.videos import DepthVideo
+from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.guess import files as guess_files
 from kinefit.readers.guess.cameras import describe_cameras, describe_uncalibrated
 from kinefit.readers.guess.draft import Draft, Entry, Note, Value
@@ -27,7 +29,6 @@ _CALIBRATE = (
 )
 
 
-_LEVEL_CAMERA = "the world is the camera's frame, assumed level: y points down"
 OPEN_HEIGHT = "height = 1.75  # open: the stature in metres, where you know it"
 """The commented line of a take file for the person's height."""
 
@@ -67,9 +68,7 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
         raise TakeError("no such folder", file=folder, remedy="Name the folder with videos, keypoints and calibration.")
     draft = Draft(folder, Path(beside).absolute() if beside else folder)
     files = guess_files.list_files(folder)
-    videos, markers = guess_files.find_videos(files, folder), guess_files.find_markers(files)
-    videos = _without_chapters(draft, videos)
-    _describe_unreadable(draft, files)
+    videos, markers = _recorded_videos(draft, files), guess_files.find_markers(files)
     keypoints, remarks = guess_files.find_keypoints(files)
     recordings = guess_files.find_recordings(files)
     for remark in remarks:
@@ -95,13 +94,16 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
     return Guess(draft.text(), tuple(draft.notes))
 
 
-def _without_chapters(draft: Draft, videos: list[Path]) -> list[Path]:
-    """The videos without those that continue another one; they become notes."""
+def _recorded_videos(draft: Draft, files: list[Path]) -> list[Path]:
+    """The videos that begin a recording; later chapters of one, and what stands in place of a file, become notes."""
+    videos = guess_files.find_videos(files, draft.folder)
     chapters = later_chapters(videos)
     for path, first in chapters.items():
-        text = f"{draft.name(path)} is a later chapter of {draft.name(first)}: one camera. Not used; join them: "
-        text += "ffmpeg -f concat -i list.txt -c copy OUT.mp4, with a line \"file 'NAME'\" of each in list.txt"
-        draft.note("video", "likely", text)
+        text = f"{draft.name(path)}: a later chapter of {draft.name(first)}, so one camera. Not used; join both: "
+        draft.note("video", "likely", f"{text}ffmpeg -f concat -i list.txt -c copy OUT.mp4 (in it: file 'NAME')")
+    for path in files:
+        if problem := guess_files.stand_in(path):
+            draft.note("files", "open", f"{draft.name(path)}: {problem}")
     return [path for path in videos if path not in chapters]
 
 
@@ -110,32 +112,28 @@ def _describe_depth(draft: Draft, files: Sequence[Path], videos: Sequence[Path],
 
     Beside no other sensor the world is that of the first depth camera; beside others depth is a comment.
     """
-    found = guess_files.find_depth(files)
-    for path, problem in found.unusable.items():
-        draft.note("depth", "open", f"{draft.name(path)}: {problem}")
-    colour = [path for path in videos if path not in found.usable]
-    for path, video in found.usable.items():
-        is_used = alone and not colour and path == next(iter(found.usable))
-        camera = "the file states its lens" if video.camera is not None else "its lens is not stated"
-        why = f"{len(video)} depth images of {video.size[0]}x{video.size[1]} px; {camera}"
+    found, single = guess_files.find_depth(files)
+    colour, seen = [path for path in videos if path not in found], list[DepthVideo]()
+    for path in single:
+        draft.note("depth", "open", f"{draft.name(path)}: one depth image, not a recording; name it in [[depth]]")
+    for path in found:
+        try:
+            seen.append(read_depth(path))
+        except KinefitError as error:
+            draft.note("depth", "open", f"{draft.name(path)}: not used as depth: {error.problem}. {error.remedy or ''}")
+            continue
+        video, is_used = seen[-1], alone and not colour and len(seen) == 1
+        why = f"{len(video)} depth images of {video.size[0]}x{video.size[1]} px"
         entry = {"name": Value(path.stem), "file": Value(path, "likely", why)}
         if video.camera is None:
             entry["intrinsics"] = Value(None, "open", "[fx, fy, cx, cy] in pixels of the depth image")
         draft.tables["depth"].append((is_used, entry))
         aside = "" if is_used else "; a comment, its pose among the other sensors is not stated"
-        draft.note(f"depth {path.stem}", "likely", f"{draft.name(path)}: {why}{aside}")
-        for text in video.notes:
+        for text in (f"{draft.name(path)}: {why}{aside}", *video.notes):
             draft.note(f"depth {path.stem}", "likely", text)
         if is_used:
-            draft.head["up"] = draft.note_value("up", Value("-y", "guess", _LEVEL_CAMERA), "up")
+            draft.head["up"] = draft.note_value("up", _up(None), "up")
     return colour
-
-
-def _describe_unreadable(draft: Draft, files: Sequence[Path]) -> None:
-    """Add a note on what a browser or a cloud left in place of a recording."""
-    for path in files:
-        if problem := guess_files.unreadable(path):
-            draft.note("files", "open", f"{draft.name(path)}: {problem}")
 
 
 def _describe_kinds(draft: Draft, files: Sequence[Path]) -> None:
@@ -219,20 +217,16 @@ def _of_one_moment(draft: Draft, videos: Sequence[Path]) -> dict[str, Path]:
     moving = [path for path in moving if draft.name(path).count("/") == depth]
     folders = list(dict.fromkeys(path.parent for path in moving))
     if len(folders) > 1 and all(COUNTED.fullmatch(path.stem) for path in moving):  # cameras count their own files
-        for folder in folders:
-            later = [draft.name(path) for path in moving if path.parent == folder][1:]
-            if later:
-                text = f"{', '.join(later)}: later recordings of {folder.name}; kinefit init on a folder of their own"
-                draft.note("video", "guess", text)
-        return {folder.name: next(path for path in moving if path.parent == folder) for folder in folders}
+        first = {folder.name: next(path for path in moving if path.parent == folder) for folder in folders}
+        for path in (path for path in moving if path not in first.values()):
+            draft.note("video", "guess", f"{draft.name(path)}: a later recording; kinefit init on its own folder")
+        return first
     named: dict[str, Path] = {}
     for path in moving:
         if path.stem in named:
-            first_name = draft.name(named[path.stem])
-            raise TakeError(
-                f"two videos are called {path.stem}: {first_name} and {draft.name(path)}", file=draft.folder,
-                remedy="Name the folder of one recording, with one video of each camera.",
-            )  # fmt: skip
+            problem = f"two videos are called {path.stem}: {draft.name(named[path.stem])} and {draft.name(path)}"
+            remedy = "Name the folder of one recording, with one video of each camera."
+            raise TakeError(problem, file=draft.folder, remedy=remedy)
         named[path.stem] = path
     return named
 
@@ -331,7 +325,7 @@ def _calibration(draft: Draft, path: Path) -> Rig | None:
 def _up(rig: Rig | None) -> Value:
     if rig is not None and len(rig) > 1:
         return Value("z", "likely", "worlds of ROS are z up (REP 103)")
-    return Value("-y", "guess", _LEVEL_CAMERA)
+    return Value("-y", "guess", "the world is the camera's frame, assumed level: y points down")
 
 
 def _depth(draft: Draft, path: Path, topics: Sequence[Shown], rig: Rig | None) -> None:

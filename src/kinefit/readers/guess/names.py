@@ -61,15 +61,11 @@ _CHAPTER = re.compile(r"(?:G[HXLP](?P<chapter>\d\d)|GOPR)(?P<number>\d{4})", re.
 
 def later_chapters(videos: Sequence[Path]) -> dict[Path, Path]:
     """{video: first chapter of its recording} of the videos that a GoPro began when a file was full."""
-    first: dict[tuple[Path, str], Path] = {}
-    out = {}
-    for path in sorted(videos, key=lambda path: (_CHAPTER.sub(r"\g<chapter>", path.stem), str(path))):
+    chapters: dict[tuple[Path, str], list[tuple[str, Path]]] = defaultdict(list)
+    for path in videos:
         if found := _CHAPTER.fullmatch(path.stem):
-            chapters = path.parent, found["number"]
-            if chapters in first:
-                out[path] = first[chapters]
-            first.setdefault(chapters, path)
-    return out
+            chapters[path.parent, found["number"]].append((found["chapter"] or "", path))
+    return {path: min(group)[1] for group in chapters.values() for _, path in sorted(group)[1:]}
 
 
 def trials(

@@ -28,7 +28,7 @@ from kinefit.errors import (
     shortened,
 )
 from kinefit.readers.depth.images import listed
-from kinefit.readers.guess.files import MARKERS, VIDEOS, unreadable
+from kinefit.readers.guess.files import MARKERS, VIDEOS, stand_in
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
@@ -205,7 +205,7 @@ def find_take(path: str | PathLike[str], *, wanted: Sequence[str] = ("track",)) 
         raise FileError("a video, not a take file", file=path, remedy=remedy)
     if kind in MARKERS:
         raise FileError("a marker file, not a take file", file=path, remedy=f"Run: {command('markers', 'fit', path)}")
-    if problem := unreadable(path):
+    if problem := stand_in(path):
         what, _, remedy = problem.partition(": ")
         raise FileError(f"{what}, not a take file", file=path, remedy=f"{remedy[:1].upper()}{remedy[1:]}.")
     if kind == ".npz":
