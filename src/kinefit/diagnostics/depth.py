@@ -76,7 +76,7 @@ def _centre(video: DepthVideo) -> list[Finding]:
     off = float(np.abs((centre - (size - 1) / 2.0) / size).max())
     if off < _MAX_CENTRE_OFFSET:
         return []
-    text = f"The principal point of {video.sensor}, {centre[0]:.4g}, {centre[1]:.4g}, is {100 * off:.0f} % of the image "
+    text = f"The principal point of {video.sensor}, {centre[0]:.4g}, {centre[1]:.4g}, is {100 * off:.0f} % of a side "
     remedy = "Give the intrinsics of the depth stream at this size, not those of the colour stream."
     sure = "A guess: an image that was cropped on one side looks the same."
     return [Finding("doubt", "intrinsics", f"{text}off its middle.", (video.sensor,), sure, remedy)]
@@ -94,7 +94,7 @@ def _along_rays(video: DepthVideo, depth: NDArray) -> list[Finding]:
     if shares[1] < max(_MIN_PLANE_SHARE, _MIN_PLANE_GAIN * shares[0]):
         return []
     on_plane = f"{100 * shares[0]:.0f} and {100 * shares[1]:.0f} % of the points lie on it"
-    text = f"A wall before {video.sensor} is curved by its depths, and flat if they are distances along rays ({on_plane})."
+    text = f"A wall before {video.sensor} is curved by its depths, and flat if they are along rays ({on_plane})."
     remedy = "Convert them: depth = distance / |ray|, with ray = ((u - cx) / fx, (v - cy) / fy, 1)."
     sure = "A guess: wrong distortion of the lens and a round room look the same."
     return [Finding("doubt", "radial", text, (video.sensor,), sure, remedy)]

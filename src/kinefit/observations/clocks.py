@@ -25,7 +25,7 @@ _MAX_MOVE_SHARE = 0.5  # of a person's extent: mean distance of its points in tw
 _MIN_MOVE_PX = 20.0  # [px] of that distance is always allowed: some people have a point or two
 
 _NUMBER = re.compile(r"\d+")
-_DECIMAL = re.compile(r"(?:^|[_-])(\d+\.\d+)$")  # the end of a name; "shot.0001" is the frame 1 of a shot
+_DECIMAL = re.compile(r"(?:^|[_\s-])(\d+\.\d+)$")  # the end of a name; "shot.0001" is the frame 1 of a shot
 _UNIX_DIGITS = {13: 1e-3, 16: 1e-6, 19: 1e-9}  # [s] of a whole number of so many digits
 _MAX_UNIX_S = 2e9  # in 2033: dates of as many digits begin with 20
 _DATE = re.compile(

@@ -223,7 +223,7 @@ def _unit_of_counts(path: Path, source: DepthSource) -> tuple[float, str]:
         return 0.000125, f"{said} three bits: unit = 0.000125 is taken; depth in steps of 8 mm would be 0.001"
     likely = [u for u in _COUNT_UNITS if u < 0.001 and _PERSON_DISTANCES[0] < median * u < _PERSON_DISTANCES[1]]
     said = f"no file states the unit: as millimetres its median is {0.001 * median:.3g} m, farther than depth cameras"
-    return 0.001, f"{said} see well. A hall looks so; else write unit = {' or '.join(f'{u:g}' for u in likely) or '...'}"
+    return 0.001, f"{said} see. A hall looks so; else write unit = {' or '.join(f'{u:g}' for u in likely) or '...'}"
 
 
 def _is_tum_list(file: Path) -> bool:

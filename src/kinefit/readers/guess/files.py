@@ -53,7 +53,7 @@ _LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
 _MASK_TOLERANCE = 10  # grey levels of a compressed mask's pixels from black or white
 _WITH_DEPTH = (".mkv", ".avi", ".mov")  # of videos that may have a track of depth
 _MIN_DEPTH_SIDE = 40  # [px]
-_MIN_DEPTH_VALUES = 30  # different ones in an image: a mask of 16 bits has few
+_MIN_DEPTH_VALUES = 15  # different ones in an image: a mask of 16 bits has few
 _MIN_GREY_SHARE = 0.1  # of the other pixels in a photograph
 
 
@@ -294,7 +294,7 @@ def _is_depth(image: Path) -> bool:
         shape, kind = npy_header(image) or ((), np.dtype(bool))
         return len(shape) == 2 and min(shape) >= _MIN_DEPTH_SIDE and kind.kind in "uf" and kind.itemsize > 1
     try:
-        return len(np.unique(depth_picture(image)[::4])) > _MIN_DEPTH_VALUES
+        return len(np.unique(depth_picture(image))) > _MIN_DEPTH_VALUES
     except KinefitError:
         return False
 
