@@ -76,7 +76,7 @@ def _matched(pattern: str) -> tuple[Path, list[Path]]:
     """The folder before the first wildcard, and the matching paths, all absolute."""
     path = Path(os.path.abspath(os.path.expanduser(pattern)))
     if path.is_dir():
-        return path, sorted(file for file in path.glob("**/*") if is_default_take(file))
+        return path, sorted(path.glob("**/[Tt][Aa][Kk][Ee].[Tt][Oo][Mm][Ll]"))
     if path.exists() or not glob.has_magic(pattern):
         return path.parent, [path] if path.exists() else []
     base = path

@@ -215,7 +215,7 @@ def find_take(path: str | PathLike[str], *, wanted: Sequence[str] = ("track",)) 
 
 def takes_in(folder: Path) -> list[Path]:
     """The take files that lie in a folder, take.toml first."""
-    takes = (file for file in folder.iterdir() if file.suffix.lower() == ".toml" and file.is_file() and is_take(file))
+    takes = (file for file in folder.glob("*") if file.suffix.lower() == ".toml" and file.is_file() and is_take(file))
     return sorted(takes, key=lambda file: (not is_default_take(file), file))
 
 
