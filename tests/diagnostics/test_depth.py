@@ -1,7 +1,5 @@
 """What a depth camera's images say of its unit, lens and kind of distance, and what a check leaves open."""
 
-import re
-
 import cv2
 import numpy as np
 import pytest
@@ -47,7 +45,7 @@ def test_units_lenses_and_rays(tmp_path, counts, how, kinds):
     findings = depth_findings(*take(tmp_path, counts, **how))
     assert [finding.kind for finding in findings] == kinds
     for finding in findings:
-        assert finding.severity == "doubt" and finding.remedy and re.search("A guess: .* looks? the same", str(finding))
+        assert finding.severity == "doubt" and finding.remedy and "A guess." in str(finding)
 
 
 def test_the_unit_that_would_fit_a_person_is_named(tmp_path):

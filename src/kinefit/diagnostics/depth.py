@@ -65,8 +65,7 @@ def _unit(video: DepthVideo, images: Sequence[NDArray], unit: float) -> list[Fin
         return []
     text = f"What moves before {video.sensor} is {extent:.3g} m large in most images: a person is smaller."
     remedy = f"Write its unit [m of a count]: about {unit * _TYPICAL_EXTENT / extent:.1g} would fit a person."
-    sure = "A guess: focal lengths that are too short, several people side by side and a vehicle look the same."
-    return [Finding("doubt", "unit", text, (video.sensor,), sure, remedy)]
+    return [Finding("doubt", "unit", text, (video.sensor,), "A guess.", remedy)]
 
 
 def _centre(video: DepthVideo) -> list[Finding]:
@@ -78,8 +77,7 @@ def _centre(video: DepthVideo) -> list[Finding]:
         return []
     text = f"The principal point of {video.sensor}, {centre[0]:.4g}, {centre[1]:.4g}, is {100 * off:.0f} % of a side "
     remedy = "Give the intrinsics of the depth stream at this size, not those of the colour stream."
-    sure = "A guess: an image that was cropped on one side looks the same."
-    return [Finding("doubt", "intrinsics", f"{text}off its middle.", (video.sensor,), sure, remedy)]
+    return [Finding("doubt", "intrinsics", f"{text}off its middle.", (video.sensor,), "A guess.", remedy)]
 
 
 def _along_rays(video: DepthVideo, depth: NDArray) -> list[Finding]:
@@ -96,8 +94,7 @@ def _along_rays(video: DepthVideo, depth: NDArray) -> list[Finding]:
     on_plane = f"{100 * shares[0]:.0f} and {100 * shares[1]:.0f} % of the points lie on it"
     text = f"A wall before {video.sensor} is curved by its depths, and flat if they are along rays ({on_plane})."
     remedy = "Convert them: depth = distance / |ray|, with ray = ((u - cx) / fx, (v - cy) / fy, 1)."
-    sure = "A guess: wrong distortion of the lens and a round room look the same."
-    return [Finding("doubt", "radial", text, (video.sensor,), sure, remedy)]
+    return [Finding("doubt", "radial", text, (video.sensor,), "A guess.", remedy)]
 
 
 def _plane_share(x: NDArray) -> float:

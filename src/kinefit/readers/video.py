@@ -75,14 +75,9 @@ class Video:
         self._source.close()
 
     @property
-    def note(self) -> str:
-        """What the file or the images' names state of their times; "" for nothing unusual."""
-        return self._source.note
-
-    @property
     def unevenness(self) -> str:
-        """What is worth saying of the times: `note`, or "variable frame rate, 60 Hz nominal, ..."; "" if even."""
-        return self.note or unevenness(self.times, self.rate)
+        """What is worth saying of the times: "variable frame rate, 60 Hz nominal, ...", or what names state."""
+        return self._source.note or unevenness(self.times, self.rate)
 
     def frame_at(self, time: float) -> int | None:
         """Number of the frame nearest to a time [s] from the first frame; None if half a frame or more outside."""

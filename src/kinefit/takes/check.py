@@ -110,6 +110,7 @@ ALL_CHECKS = (
     Check(
         "unit and lens of depth cameras", lambda c: depth_findings(c.take, c.observations.depth),
         ("take", "observations"), 1.0,
+        "Wrong focal lengths, people side by side, an image cropped on one side and a round room look the same.",
     ),
     Check(
         "depth cameras alone", _depth_alone, ("take", "observations"), 20.0,

@@ -168,7 +168,7 @@ def test_the_body_is_found_by_values_colours_and_size(tmp_path, image, said):
 @pytest.mark.parametrize(("image", "said"), [
     (255 - BODY, "white covers 83 %.*inverted"),
     (cv2.merge([255 - BODY] * 3 + [np.full_like(BODY, 255)]), "inverted"),
-    (np.where(BODY > 0, 24, 7).astype(np.uint8), "labels of many things"),
+    (np.where(BODY > 0, 24, 7).astype(np.uint8), "labels of all"),
     (np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8), "photographs"),
     (np.random.default_rng(0).integers(0, 255, (48, 64)).astype(np.uint8), "grey values"),
     (BODY[:, 8:56], "48x48 px, not 64x48"),

@@ -109,31 +109,26 @@ def track_source(path: Path, name: str) -> DepthSource:
     )  # fmt: skip
 
 
-def depth_tracks(path: Path) -> str:
-    """Titles of the depth tracks of a container, as recorders name them; "" without."""
+def has_depth_track(path: Path) -> bool:
+    """Whether a container has a video track that its recorder names as depth."""
     try:
         with open_container(path) as container:
-            return ", ".join(_title(stream) for stream in container.streams.video if _is_named_depth(stream))
+            return any(map(_is_named_depth, container.streams.video))
     except KinefitError:
-        return ""
-
-
-def _title(stream: Any) -> str:
-    return str(stream.metadata.get("title", f"track {stream.index}"))
+        return False
 
 
 def _is_named_depth(stream: Any) -> bool:
-    return _title(stream).upper() == "DEPTH" or "K4A_DEPTH_MODE" in stream.metadata
+    return stream.metadata.get("title", "").upper() == "DEPTH" or "K4A_DEPTH_MODE" in stream.metadata
 
 
 def _depth_stream(container: Any) -> Any:
     videos = container.streams.video
-    named = [stream for stream in videos if _is_named_depth(stream)]
-    if named:
+    if named := list(filter(_is_named_depth, videos)):
         return named[0]
     if len(videos) == 1:
         return videos[0]
-    titles = ", ".join(map(_title, videos)) or "none"
+    titles = ", ".join(s.metadata.get("title", f"track {s.index}") for s in videos) or "none"
     raise FileError(f"no depth track; its video tracks: {titles}", remedy="Record with the depth camera on.")
 
 

@@ -113,21 +113,19 @@ def describe_uncalibrated(draft: Draft, videos: Mapping[str, Path]) -> None:
 
 def _time_codes(draft: Draft, opened: Mapping[str, Video]) -> dict[str, dict[str, Value]]:
     """{camera: its `time_offset`} by the time codes of all videos; none where they are equal, or one lacks it."""
-    codes = {name: stated_time_code(video.path, video.rate) for name, video in opened.items()}
-    starts = {name: code[0] for name, code in codes.items() if code is not None}
-    if len(starts) < len(opened) or len(opened) < 2 or max(starts.values()) == (first := min(starts.values())):
+    found = {name: stated_time_code(video.path, video.rate) for name, video in opened.items()}
+    codes = {name: code for name, code in found.items() if code is not None}
+    late = np.ptp([start for start, _ in codes.values()]) if codes else 0.0
+    if len(codes) < len(opened) or not late:
         return {}
-    late = max(starts, key=lambda name: starts[name])
-    shortest = min(float(video.times[-1]) for video in opened.values())
-    if starts[late] - first > shortest:
-        text = f"their time codes are {starts[late] - first:.6g} s apart, and the shortest video has {shortest:.3g} s: "
-        draft.note("clocks", "open", f"{text}not used; clocks that nobody set look so")
+    if late > (shortest := min(float(video.times[-1]) for video in opened.values())):
+        text = f"time codes {late:.6g} s apart, of videos of {shortest:.3g} s: not used, as clocks that nobody set"
+        draft.note("clocks", "open", text)
         return {}
     draft.note("clocks", "likely", "time_offset of each camera by its time code; clocks that nobody set look the same")
-    return {
-        name: {"time_offset": Value(starts[name] - first, "likely", f"its time code {code[1]}")}
-        for name, code in codes.items() if code is not None
-    }  # fmt: skip
+    first = min(start for start, _ in codes.values())
+    why = "its time code "
+    return {name: {"time_offset": Value(start - first, "likely", why + code)} for name, (start, code) in codes.items()}
 
 
 def _nothing_fits(draft: Draft, calibration: CalibrationFile, *, found: bool) -> TakeError:

@@ -21,7 +21,7 @@ from kinefit.errors import CalibrationError, FileError, KinefitError
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, read_calibration
 from kinefit.readers.depth.images import PICTURES, depth_picture, natural
-from kinefit.readers.depth.streams import depth_tracks
+from kinefit.readers.depth.streams import has_depth_track
 from kinefit.readers.guess.names import camera_of
 from kinefit.readers.keypoint_sets import SPLIT, other_keypoints
 from kinefit.readers.keypoints import decode_openpose
@@ -275,7 +275,8 @@ def _is_photograph(grey: NDArray) -> bool:
 
 def find_depth(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     """Depth among files: folders or patterns of images and videos with a depth track; images that are alone."""
-    found, single = [path for path in files if path.suffix.lower() in _WITH_DEPTH and depth_tracks(path)], list[Path]()
+    found = [path for path in files if path.suffix.lower() in _WITH_DEPTH and has_depth_track(path)]
+    single = list[Path]()
     for folder, group in _by_folder(list(files)):
         series: dict[str, list[Path]] = {}
         for path in (path for path in group if path.suffix.lower() in (*PICTURES, ".npy")):

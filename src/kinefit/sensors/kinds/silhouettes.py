@@ -115,19 +115,18 @@ def read_silhouettes(
         times, said = _mask_times(numbered, rate, clock)
         code = MaskCode.of(_sampled(files))
     wanted = image_size or (size if image_frame is None else code.size)
-    own = _fitting_size(code.size, wanted, files[0])
-    notes = [text for text in (said, code.note) if text]
-    if own != wanted:
-        notes.append(f"masks have {own[0]}x{own[1]} px: scaled to {wanted[0]}x{wanted[1]}")
+    _check_shape(code.size, wanted, files[0])
+    scaled = f"masks have {code.size[0]}x{code.size[1]} px: scaled to {wanted[0]}x{wanted[1]}" * (code.size != wanted)
+    notes = tuple(text for text in (said, code.note, scaled) if text)
 
     def image(i: int) -> NDArray:
         mask = code.mask(read_picture(files[i], cv2.IMREAD_UNCHANGED))
-        _fitting_size(mask.shape[::-1], own, files[i])
+        _check_shape(mask.shape[::-1], wanted, files[i])
         mask = mask if mask.shape[::-1] == wanted else cv2.resize(mask, wanted, interpolation=cv2.INTER_LINEAR)
         return in_calibration(mask, size, image_frame)
 
     own_rate = rate if is_even(times, rate) or len(times) < 2 else nominal_rate(times)
-    return SilhouetteVideo(camera, own_rate, time_offset + times, size, image, str(path), tuple(notes))
+    return SilhouetteVideo(camera, own_rate, time_offset + times, size, image, str(path), notes)
 
 
 def _sampled(files: Sequence[Path]) -> list[NDArray]:
@@ -150,12 +149,11 @@ def _mask_times(numbered: NamedFrames, rate: float, clock: NDArray | None) -> tu
     return clock[numbered.numbers - first], f"{len(times)} masks of the video's {len(clock)} frames, by their numbers"
 
 
-def _fitting_size(size: tuple[int, int], wanted: tuple[int, int], file: Path) -> tuple[int, int]:
-    """The size (width, height) [px] of a mask; ObservationError where it has not the shape that is wanted."""
+def _check_shape(size: tuple[int, int], wanted: tuple[int, int], file: Path) -> None:
+    """Raise ObservationError where the size (width, height) [px] of a mask has not the shape that is wanted."""
     if abs(size[0] * wanted[1] - size[1] * wanted[0]) > max(*size, *wanted):  # a pixel by rounding
         problem = f"the mask has {size[0]}x{size[1]} px, not {wanted[0]}x{wanted[1]}"
         raise ObservationError(problem, file=file, remedy="Give masks of the size of the camera's image.")
-    return size
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,10 +198,9 @@ class MaskCode:
         share = float(np.median([mask.mean() for mask in masks] or [0.0]))
         if share > _MAX_BODY_SHARE and np.median([_border(mask).mean() for mask in masks]) > _MAX_BODY_BORDER:
             what = "white" if code.background is None else "all but the background's value"
-            raise ObservationError(
-                f"{what} covers {100 * share:.0f} % of the masks and their border: inverted, or labels of many things",
-                remedy="Make the body white and all else black. A body that fills the image looks the same.",
-            )
+            problem = f"{what} covers {100 * share:.0f} % of the masks and their border: inverted, or labels of all"
+            remedy = "Make the body white and all else black. A body that fills the image looks the same."
+            raise ObservationError(problem, remedy=remedy)
         return code
 
     def mask(self, image: NDArray) -> NDArray:
