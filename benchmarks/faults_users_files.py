@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -75,7 +76,7 @@ def state(is_right: bool, told: str, *words: str) -> str:
     return "right" if is_right else "said" if is_said else "unsaid"
 
 
-def _tried(read: Callable[[], object]) -> tuple[object | None, str]:
+def _tried(read: Callable[[], Any]) -> tuple[Any, str]:
     """What a reader returns, and its error's text."""
     try:
         return read(), ""
@@ -187,7 +188,7 @@ def write_depth(folder: Path, counts: NDArray, name: str = "{:04d}.png") -> Path
     return folder / "depth"
 
 
-def depth(write: Callable[[Path], object], *words: str, times: NDArray | None = None, **given: object) -> Answer:
+def depth(write: Callable[[Path], object], *words: str, times: NDArray | None = None, **given: Any) -> Answer:
     """Whether depth is read as the scene's, at its times, or something says these words."""
 
     def answer(folder: Path) -> str:
@@ -236,7 +237,7 @@ def _npy(values: NDArray) -> Callable[[Path], None]:
     return write
 
 
-def _depth_case(**given: object) -> Answer:
+def _depth_case(**given: Any) -> Answer:
     def answer(folder: Path) -> str:
         video = read_depth(folder / "depth", rate=30.0, **given)
         z = video.frame(0).depth
@@ -365,7 +366,8 @@ def _lsl(_: Path) -> str:
     zero, sent = pylsl.local_clock(), [k / 50.0 for k in range(60) if not 20 <= k < 45]
     for due in sent:
         time.sleep(max(zero + due - pylsl.local_clock(), 0.0))
-        out.pose(SimpleNamespace(result=result, Ts_world_segment=poses, time=0.0, latency=0.1), b"")
+        posed: Any = SimpleNamespace(result=result, Ts_world_segment=poses, time=0.0, latency=0.1)
+        out.pose(posed, b"")
     stamps = np.array(inlet.pull_chunk(timeout=1.0, max_samples=100)[1])
     out.close()
     even = inlet.info().nominal_srate() != pylsl.IRREGULAR_RATE  # readers then space them evenly

@@ -706,3 +706,15 @@ def test_time_codes_are_offsets_where_all_state_them(folder):
     assert "time_offset" not in guess_take(folder).text
     write_video(folder / "b.mov", frames=60)
     assert "time_offset" not in guess_take(folder).text
+
+
+def test_numpy_files_are_depth_where_they_hold_images(folder):
+    image = np.tile(np.linspace(2.0, 3.0, 64, dtype=np.float32), (48, 1))
+    np.save(folder / "walk.npy", np.stack([image] * 4))
+    assert 'file = "walk.npy"' in guess_take(folder).text and "4 depth images" in notes(guess_take(folder))
+    np.save(folder / "walk.npy", image)
+    with pytest.raises(TakeError, match=r"walk.npy: one depth image"):
+        guess_take(folder)
+    np.save(folder / "walk.npy", np.random.default_rng(0).random((90, 33, 4)))  # points of somebody's program
+    with pytest.raises(TakeError, match=r"among 1 files\."):
+        guess_take(folder)

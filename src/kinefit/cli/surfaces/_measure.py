@@ -235,7 +235,7 @@ def measure_one_camera(photographs: Sequence[Path], millimetres: float, wanted: 
         given = ", ".join(named) or ("--seeds" if wanted.seeds else "one photograph")
         problem = f"--flat does not work with {given}"
         raise ObservationError(problem, remedy="Give only photographs of one camera, before and after.")
-    given, photographs = photographs, in_number_order(photographs)
+    as_given, photographs = photographs, in_number_order(photographs)
     states = [spline_of(read_photograph(path), wanted.field, wanted.smooth) for path in photographs]
     grid = Grid.of(states[0].size, wanted.step, mask=mask_of(wanted.mask, wanted.field))
     window = wanted.side(states[0], states[1], grid)
@@ -243,7 +243,7 @@ def measure_one_camera(photographs: Sequence[Path], millimetres: float, wanted: 
         states, grid, millimetres / 1e3, window=window, incremental=wanted.incremental,
         least=MIN_CORRELATION if wanted.least is None else wanted.least,
     )  # fmt: skip
-    reordered = ["photographs in the order of their numbers, not of the shell's pattern"] * (given != photographs)
+    reordered = ["photographs in the order of their numbers, not of the shell's pattern"] * (as_given != photographs)
     return reordered + _write_all(surfaces, photographs, wanted, int(np.max(window)))
 
 

@@ -20,7 +20,7 @@ from kinefit._pictures import read_picture
 from kinefit.errors import CalibrationError, FileError, KinefitError
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, read_calibration
-from kinefit.readers.depth.images import PICTURES, depth_picture, natural
+from kinefit.readers.depth.images import PICTURES, natural, npy_source, picture_source
 from kinefit.readers.depth.streams import has_depth_track
 from kinefit.readers.guess.names import camera_of
 from kinefit.readers.keypoint_sets import SPLIT, other_keypoints
@@ -281,23 +281,23 @@ def find_depth(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
         series: dict[str, list[Path]] = {}
         for path in (path for path in group if path.suffix.lower() in (*PICTURES, ".npy")):
             series.setdefault(re.sub(r"\d+", "*", path.name), []).append(path)
-        for pattern, images in ((pattern, images) for pattern, images in series.items() if _is_depth(images[0])):
-            if len(images) > 1:
-                found.append(folder if len(series) == 1 else folder / re.sub(r"\*.*\*", "*", pattern))
-            else:
+        for pattern, images in series.items():
+            count = _depth_images(images[0]) * len(images)
+            if count > 1:
+                found.append(folder if len(series) == 1 < len(images) else folder / re.sub(r"\*.*\*", "*", pattern))
+            elif count:
                 single += images
     return found, single
 
 
-def _is_depth(image: Path) -> bool:
-    """Whether an image has one channel of 16 bits or float, and many values, as a mask has not."""
-    if image.suffix.lower() == ".npy":
-        shape, kind = npy_header(image) or ((), np.dtype(bool))
-        return len(shape) == 2 and min(shape) >= _MIN_DEPTH_SIDE and kind.kind in "uf" and kind.itemsize > 1
+def _depth_images(file: Path) -> int:
+    """Number of depth images in a file: of one channel of 16 bits or float, and many values, as a mask has not."""
     try:
-        return len(np.unique(depth_picture(image))) > _MIN_DEPTH_VALUES
+        source = npy_source([file]) if file.suffix.lower() == ".npy" else picture_source([file])
+        is_depth = min(source.size) >= _MIN_DEPTH_SIDE and len(np.unique(source.image(0))) > _MIN_DEPTH_VALUES
+        return source.count * is_depth
     except KinefitError:
-        return False
+        return 0
 
 
 _STAND_INS = {

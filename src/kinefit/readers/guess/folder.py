@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kinefit._files import repeated
 from kinefit.errors import CalibrationError, KinefitError, PluginError, TakeError, command
 from kinefit.geometry.camera import Rig
 from kinefit.observations.videos import DepthVideo
@@ -221,14 +222,12 @@ def _of_one_moment(draft: Draft, videos: Sequence[Path]) -> dict[str, Path]:
         for path in (path for path in moving if path not in first.values()):
             draft.note("video", "guess", f"{draft.name(path)}: a later recording; kinefit init on its own folder")
         return first
-    named: dict[str, Path] = {}
-    for path in moving:
-        if path.stem in named:
-            problem = f"two videos are called {path.stem}: {draft.name(named[path.stem])} and {draft.name(path)}"
-            remedy = "Name the folder of one recording, with one video of each camera."
-            raise TakeError(problem, file=draft.folder, remedy=remedy)
-        named[path.stem] = path
-    return named
+    if twice := repeated(path.stem for path in moving):
+        both = [draft.name(path) for path in moving if path.stem == twice[0]]
+        problem = f"two videos are called {twice[0]}: {both[0]} and {both[1]}"
+        remedy = "Name the folder of one recording, with one video of each camera."
+        raise TakeError(problem, file=draft.folder, remedy=remedy)
+    return {path.stem: path for path in moving}
 
 
 def _above(folder: Path) -> list[Path]:
