@@ -337,7 +337,8 @@ def test_streams_that_began_when_they_liked_have_what_all_saw():
 
 
 @pytest.mark.parametrize(("stated", "rate", "said"), [("240.0", 240.0, "slow motion"), ("2", 2.0, "time lapse"),
-                                                      ("30.0", 30.0, ""), ("fast", 30.0, "")])  # fmt: skip
+                                                      ("30.0", 30.0, ""), ("fast", 30.0, ""),
+                                                      ("60", 30.0, "in the dark and slow motion")])  # fmt: skip
 def test_the_rate_of_the_capture_comes_before_that_of_playing(tmp_path, stated, rate, said):
     path = write(tmp_path / "v.mp4", 20, tags={"com.android.capture.fps": stated})
     with Video(path) as video:

@@ -24,6 +24,8 @@ _CODECS_WITH_HIDDEN_FRAMES = ("vp8",)  # their packets cannot be counted: some s
 _MIN_MPEG4_BYTES = 10  # of a frame; less says only that it repeats the one before, and nothing is decoded
 _CAPTURE_RATE = "com.android.capture.fps"
 _MAX_CAPTURE_ERROR = 0.1  # of the stored rate: a telephone's rate varies
+_MIN_SLOW_MOTION_HZ = 100.0  # telephones capture it at 120 or more; at 60 Hz they leave out frames where it is dark
+_MAX_TIME_LAPSE = 0.6  # of the stored rate
 _TIME_CODE = re.compile(r"(\d\d):(\d\d):(\d\d)([:;.])(\d\d)")
 _REMEDY = "Copy the file again from its source, or re-encode it."
 
@@ -52,9 +54,11 @@ class VideoFile:
         captured = _capture_rate(self._container)
         if captured is not None and abs(captured / self.rate - 1.0) > _MAX_CAPTURE_ERROR:
             stated = f"captured at {captured:.6g} Hz as the file states ({_CAPTURE_RATE}), stored at {self.rate:.6g} Hz"
-            kind = "slow motion" if captured > self.rate else "time lapse"
-            self.note = f"{kind}: {stated}; times are those of the capture"
-            self.times, self.rate = self.times * (self.rate / captured), captured
+            self.note = f"{stated}: times are those of playing; frames left out in the dark and slow motion look the same"
+            if captured < _MAX_TIME_LAPSE * self.rate or captured > max(_MIN_SLOW_MOTION_HZ, 1.9 * self.rate):
+                kind = "slow motion" if captured > self.rate else "time lapse"
+                self.note = f"{kind}: {stated}; times are those of the capture"
+                self.times, self.rate = self.times * (self.rate / captured), captured
         self._restart()
 
     def __len__(self) -> int:
