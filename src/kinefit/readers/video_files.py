@@ -54,7 +54,7 @@ class VideoFile:
         captured = _capture_rate(self._container)
         if captured is not None and abs(captured / self.rate - 1.0) > _MAX_CAPTURE_ERROR:
             stated = f"captured at {captured:.6g} Hz as the file states ({_CAPTURE_RATE}), stored at {self.rate:.6g} Hz"
-            self.note = f"{stated}: times are those of playing; frames left out in the dark and slow motion look the same"
+            self.note = f"{stated}: times are those of playing; frames left out in the dark and slow motion look alike"
             if captured < _MAX_TIME_LAPSE * self.rate or captured > max(_MIN_SLOW_MOTION_HZ, 1.9 * self.rate):
                 kind = "slow motion" if captured > self.rate else "time lapse"
                 self.note = f"{kind}: {stated}; times are those of the capture"
