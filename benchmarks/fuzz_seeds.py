@@ -400,7 +400,9 @@ def _masks(folder: Path) -> Seed:
 
     (folder / "masks").mkdir()
     for i in range(2):
-        cv2.imwrite(str(folder / "masks" / f"{i}.png"), np.full((48, 64), 255 * i, np.uint8))
+        mask = np.zeros((48, 64), np.uint8)
+        mask[10:30] = 255 * i
+        cv2.imwrite(str(folder / "masks" / f"{i}.png"), mask)
 
     def read() -> object:
         video = read_silhouettes(folder / "masks", camera="a", rate=30.0, size=(64, 48))

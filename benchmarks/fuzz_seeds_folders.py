@@ -95,7 +95,8 @@ def _masks(folder: Path) -> Seed:
     shapes = (48, 64), (48, 64, 3), (48, 64, 4)
     (folder / "masks").mkdir()
     for i, (shape, packing) in enumerate(zip(shapes, packings)):
-        mask = np.full(shape, 255, np.uint8 if i else np.uint16)
+        mask = np.zeros(shape, np.uint8 if i else np.uint16)
+        mask[10:30] = 255
         cv2.imwrite(str(folder / "masks" / f"{i}.tif"), mask, [cv2.IMWRITE_TIFF_COMPRESSION, packing])
 
     def read() -> object:

@@ -23,7 +23,7 @@ from kinefit.readers.video import Video
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ('[a]\nfile = "C:\\Users\\me\\x.toml"', r"line 2.*single quotes. Write 'C:\\Users\\me\\x.toml'"),
+        ('[a]\nfile = "C:\\Users\\me\\x.toml"', r'line 2.*forward slashes. Write "C:.Users.me.x.toml"'),
         ('file = "C:\\data\\x.toml"', "forward slashes"),
         ("size = True", "Write true"),
         ('name = walk', 'quotes: name = "walk"'),

@@ -26,8 +26,13 @@ _Record = TypeVar("_Record")
 _MIN_STEP_S = 1e-6  # between frames of a table; shorter or longer than its inverse, times are in another unit
 _MAX_TOML_CHARACTERS = 4_000_000  # which tomllib reads in about 2 s; kinefit's own files have thousands
 _DOTTED = re.compile(r"(?<![\w.-])(?:(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+\.[ \t]*+){50}")
-BACKSLASHES = "A backslash in double quotes begins a special character: use forward slashes, or single quotes."
+BACKSLASHES = "A backslash in double quotes begins a special character: use forward slashes."
 """What to do about C:\\Users in a TOML file."""
+
+
+def with_slashes(path: str) -> str:
+    """A path with forward slashes in place of backslashes, single or doubled, as every system reads it."""
+    return re.sub(r"\\+", "/", path)
 
 
 def no_column(missing: Iterable[str], names: Iterable[str] | None) -> str:
@@ -198,7 +203,7 @@ def _remedy(text: str, problem: str) -> str:
     value = line.partition("=")[2].partition("#")[0].strip()
     if ("hex value" in problem or "Unescaped" in problem) and "\\" in line:
         path = re.search(r"\"([^\"]*)\"?", line)
-        return f"{BACKSLASHES} Write '{path[1]}'." if path and len(path[1]) < 120 else BACKSLASHES
+        return f'{BACKSLASHES} Write "{with_slashes(path[1])}".' if path and len(path[1]) < 120 else BACKSLASHES
     if value in ("True", "False", "yes", "no", "Yes", "No"):
         return f"Write {'true' if value in ('True', 'yes', 'Yes') else 'false'}."
     if "overwrite" in problem:

@@ -1,10 +1,13 @@
 """Keypoints of frames at any times are put onto even steps: against a moving point that is known everywhere."""
 
+import re
+
 import numpy as np
 import pytest
 
+from kinefit.errors import ObservationError
 from kinefit.observations import Keypoints
-from kinefit.observations.clocks import is_even, nominal_rate, on_steps, steps_of, unevenness
+from kinefit.observations.clocks import frames_by_name, is_even, nominal_rate, on_steps, steps_of, unevenness
 
 RATE = 60.0
 SPEED, SWAY, TURN = 400.0, 30.0, 6.0  # [px/s], [px], [rad/s]
@@ -95,3 +98,35 @@ def test_rates_and_what_is_said_of_them():
     assert steps_of(ALL[::2] + 0.1, RATE) == (6, 125) and steps_of(ALL + 0.1, RATE) == (6, 126)
     assert steps_of(np.array([0.5]), RATE) == (30, 31)
     assert len(on_steps(seen(ALL[:1]), ALL[:1], RATE, (0, 2))) == 2
+
+
+@pytest.mark.parametrize(("names", "times", "said"), [
+    (["a_1.png", "a_2.png", "a_3.png"], [0, 1 / 30, 2 / 30], ""),
+    (["0.png", "3.png", "6.png"], [0, 0.1, 0.2], "step by 3.*rate = 90"),
+    (["0003_mask.png", "0006_mask.png", "0012_mask.png"], [0, 0.1, 0.3], "step by 3"),
+    (["f8.png", "f9.png", "f12.png"], [0, 1 / 30, 4 / 30], "2 numbers are missing"),
+    (["d00_cam2.png", "d05_cam2.png"], [0, 5 / 30], "step by 5"),  # the number that differs is the frame's
+    (["1305031102.160407.png", "1305031102.260407.png"], [0, 0.1], "are taken as their times"),  # TUM
+    (["1403636579763555584.png", "1403636579813555584.png"], [0, 0.05], "times"),  # EuRoC [ns]
+    (["d_1714566605123.png", "d_1714566605223.png"], [0, 0.1], "times"),
+    (["2024-05-01_12-30-05-900.png", "2024-05-01_12-30-06-000.png"], [0, 0.1], "times"),
+    (["20240501123005950.png", "20240501123006000.png"], [0, 0.05], "times"),
+    (["0.0333.png", "0.0667.png"], [0, 0.0334], "times"),
+    (["d33.png", "d67.png", "d100.png", "d133.png"], [0, 0.034, 0.067, 0.1], "times in 0.001 s.*look the same"),
+    (["shot1.0001.png", "shot1.0002.png"], [0, 1 / 30], ""),  # a frame's number, not a decimal
+    (["d-82823944", "d-1028894671"], [0, 1 / 30], "not used.*time_unit"),
+    (["start.png", "end.png"], [0, 1 / 30], ""),
+])  # fmt: skip
+def test_numbers_in_names_are_frames_or_times(names, times, said):
+    found, text = frames_by_name(names).on_clock(30.0)
+    np.testing.assert_allclose(found, times, atol=1e-6)
+    assert re.search(said, text) and bool(said) == bool(text)
+
+
+@pytest.mark.parametrize("names", [
+    ["0001.png", "0001_overlay.png", "0002.png"], ["cam1_01.png", "cam1_02.png", "cam2_01.png"],
+])  # fmt: skip
+def test_two_files_with_one_number_are_named(names):
+    with pytest.raises(ObservationError, match="two masks with one number: .*01.* and .*01") as told:
+        frames_by_name(names, "masks")
+    assert "pattern" in told.value.remedy

@@ -112,3 +112,14 @@ def test_a_take_of_folders_has_the_rate_of_the_take(tmp_path):
     take.write_text('[calibration]\nfile = "calibration.toml"\n' + cameras)
     with pytest.raises(ObservationError, match="states no frame rate"):
         load_observations(read_take(take))
+
+
+def test_images_of_every_third_frame_take_their_time(tmp_path):
+    with Video(draw(tmp_path / "cam", range(0, 15, 3)), rate=30.0) as video:
+        np.testing.assert_allclose(video.times, np.arange(5) / 10.0)
+        assert "step by 3" in video.unevenness and "rate = 90" in video.unevenness
+        assert video.frame_at(0.21) == 2 and video.rate == 30.0
+    for i in (0, 3, 6, 9, 12):
+        (tmp_path / "cam" / f"img{i}.png").rename(tmp_path / "cam" / f"[b] {1700000000 + i / 10:.3f}.png")
+    with Video(tmp_path / "cam" / "[b]*.png", rate=3.0) as video:  # brackets of a name, and times
+        np.testing.assert_allclose(video.times, 0.3 * np.arange(5), atol=1e-5)

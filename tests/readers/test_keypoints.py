@@ -130,11 +130,11 @@ def test_the_keypoint_set_that_fits_is_proposed(tmp_path):
 
 def test_missing_and_doubled_frames(tmp_path):
     folder = write(tmp_path / "json", {0: [person()], 1: [person()], 4: [person()]})
-    with pytest.raises(ObservationError, match="2 of the frames 0 to 4 are missing, the first is 2"):
+    with pytest.raises(ObservationError, match="frames are missing between .*1.* and .*4"):
         read(folder)
     other = write(tmp_path / "two", {0: [person()]})
     write(other, {0: [person()]}, name="other_{:03d}.json")
-    with pytest.raises(ObservationError, match="frame 0 appears twice"):
+    with pytest.raises(ObservationError, match="two frames with one number.*one camera in each folder"):
         read(other)
     (tmp_path / "named").mkdir()
     (tmp_path / "named" / "all.json").write_text("{}")

@@ -10,7 +10,7 @@ import pytest
 
 from kinefit.errors import FileError, ObservationError
 from kinefit.readers.video import Video, VideoSet, common_frames
-from kinefit.readers.video_files import _display_axes, first_image
+from kinefit.readers.video_files import _display_axes, first_image, stated_time_code
 
 COUNT, WIDTH, HEIGHT = 40, 160, 96
 MATRICES = {  # a, b, c, d of the display matrix: what FFmpeg 9 shows of it
@@ -38,8 +38,11 @@ def number(image):
 
 
 def write(path, count=COUNT, rate=30, codec="mpeg4", **options):
-    with av.open(str(path), "w") as container:
+    with av.open(str(path), "w", options={"movflags": "use_metadata_tags"} if "tags" in options else {}) as container:
+        container.metadata.update(options.get("tags", {}))
         stream = container.add_stream(codec, rate=rate)
+        if options.get("timecode"):
+            stream.metadata["timecode"] = options["timecode"]
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, options.get("pixels", "yuv420p")
         stream.codec_context.gop_size = 12
         stream.codec_context.max_b_frames = options.get("b_frames", 2)
@@ -331,3 +334,26 @@ def test_streams_that_began_when_they_liked_have_what_all_saw():
     assert common_frames(clocks, 30.0, overlap=True) == (15, 75)
     with pytest.raises(ObservationError, match="streams of different length"):
         common_frames(clocks, 30.0)
+
+
+@pytest.mark.parametrize(("stated", "rate", "said"), [("240.0", 240.0, "slow motion"), ("2", 2.0, "time lapse"),
+                                                      ("30.0", 30.0, ""), ("fast", 30.0, ""),
+                                                      ("60", 30.0, "in the dark and slow motion")])  # fmt: skip
+def test_the_rate_of_the_capture_comes_before_that_of_playing(tmp_path, stated, rate, said):
+    path = write(tmp_path / "v.mp4", 20, tags={"com.android.capture.fps": stated})
+    with Video(path) as video:
+        assert abs(video.rate - rate) < 1e-6 and np.allclose(video.times, np.arange(20) / rate)
+        assert said in video.unevenness and bool(said) == bool(video.unevenness)
+        assert number(video.read(7)) == 7
+
+
+@pytest.mark.parametrize(("code", "rate", "seconds"), [
+    ("10:00:00:15", 30, 36000.5), ("00:00:01:00", Fraction(30000, 1001), 1.001),
+    ("00:10:00;00", Fraction(30000, 1001), 600.0 - 0.0006), ("00:01:00;02", Fraction(30000, 1001), 60.06),
+    ("", 30, None),
+])  # fmt: skip
+def test_time_codes_are_seconds(tmp_path, code, rate, seconds):
+    path = write(tmp_path / "v.mov", 5, rate=rate, timecode=code)
+    found = stated_time_code(path, float(rate))
+    assert found is None if seconds is None else (abs(found[0] - seconds) < 2e-3 and found[1] == code)
+    assert stated_time_code(tmp_path, 30.0) is None  # a folder of images

@@ -15,7 +15,7 @@ from kinefit.batch.one import Choices, TakeJob, work
 from kinefit.batch.processes import Failure, run_here
 from kinefit.batch.summary import RECORD, Row, failed, write_summary
 from kinefit.errors import ExportError, FileError, KinefitError, command, printable
-from kinefit.readers.take.file import is_take, takes_in
+from kinefit.readers.take.file import is_default_take, is_take, takes_in
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def _matched(pattern: str) -> tuple[Path, list[Path]]:
     """The folder before the first wildcard, and the matching paths, all absolute."""
     path = Path(os.path.abspath(os.path.expanduser(pattern)))
     if path.is_dir():
-        return path, sorted(path.glob("**/take.toml"))
+        return path, sorted(path.glob("**/[Tt][Aa][Kk][Ee].[Tt][Oo][Mm][Ll]"))
     if path.exists() or not glob.has_magic(pattern):
         return path.parent, [path] if path.exists() else []
     base = path
@@ -89,7 +89,7 @@ def _takes_at(hit: Path) -> Iterable[Path]:
     if not hit.is_dir():
         return [hit] if hit.suffix.lower() == ".toml" else []
     takes = takes_in(hit)
-    return takes[:1] if takes and takes[0].name == "take.toml" else takes
+    return takes[:1] if takes and is_default_take(takes[0]) else takes
 
 
 def _is_result(take: Path, base: Path) -> bool:

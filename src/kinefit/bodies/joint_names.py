@@ -145,6 +145,11 @@ FAMILIES = (
         knuckle="middle_01_{s}",
     ),
     NamingConvention(
+        "Rokoko", _trunk("Hips", "Spine1", "Spine4", "Neck", "Head", "{Side}Shoulder"),
+        ("{Side}Thigh", "{Side}Shin", "{Side}Foot", "{Side}Toe", "{Side}Arm", "{Side}ForeArm", "{Side}Hand"),
+        knuckle="{Side}Finger3Metacarpal",
+    ),
+    NamingConvention(
         "Biped", _trunk("Pelvis", "Spine", "Spine2", "Neck", "Head", "{S} Clavicle"),
         ("{S} Thigh", "{S} Calf", "{S} Foot", "{S} Toe0", "{S} UpperArm", "{S} Forearm", "{S} Hand"),
         knuckle="{S} Finger2",

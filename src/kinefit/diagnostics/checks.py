@@ -23,6 +23,7 @@ from kinefit.findings import Finding, faults_of, ranked
 from kinefit.geometry.camera import Rig
 from kinefit.multiview.followed import follow
 from kinefit.observations import Keypoints
+from kinefit.readers.calibration.read import found_notes
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.videos import TakePictures
@@ -207,8 +208,9 @@ def _covered(c: Checked) -> list[Finding]:
 
 
 def _notes(c: Checked) -> list[Finding]:
-    """What marker files contradict."""
-    return [Finding("note", "markers", f"{text}.") for m in c.observations.markers for text in m.notes]
+    """What readers have to say of their files."""
+    found = found_notes(c.take.calibration)
+    return [Finding("note", "files", f"{text}.") for text in c.observations.notes if text not in found]
 
 
 def _person(c: Checked) -> list[Finding]:
@@ -343,7 +345,7 @@ CHECKS = (
         ("take", "observations"), 2.0,
         "Sunlight, a second depth camera and a worn sensor look the same.",
     ),
-    Check("marker files", _notes, ("take", "observations"), reads=True),
+    Check("notes on files", _notes, ("take", "observations"), reads=True),
     Check("person", _person, ("take", "observations"), reads=True),
     Check(
         "lens", lambda c: rig.lens_findings(c.rig), ("rig",),

@@ -105,8 +105,8 @@ def too_few(take: Take, seen: Observations, cameras: int) -> list[Finding]:
         return []
     if take.markers and not take.cameras:
         return [Finding("note", "load", "Markers alone: their labels are checked, and nothing else.")]
-    if take.sensors and not take.cameras:
-        return [Finding("note", "load", "No cameras: each sensor is checked by itself, and nothing else.")]
+    if take.sensors and not take.keypoints and not cameras:
+        return [Finding("note", "load", "No keypoints: each sensor is checked by itself, and nothing else.")]
     text = f"Keypoints of {cameras} camera(s): a check needs those of two or more."
     alone = len(take.cameras) == 1
     remedy = f"{ONE_CAMERA[0].upper()}{ONE_CAMERA[1:]}." if alone else f"Run: {command('detect', take.path)}"

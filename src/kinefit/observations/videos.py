@@ -134,6 +134,8 @@ class ColourVideo(SensorRecording):
         Frame number -> (H, W, 3) uint8 RGB in the calibration's image frame.
     source : str
         File or folder, for messages.
+    notes : tuple of str
+        What the reader has to say of the files.
 
     Raises
     ------
@@ -144,6 +146,7 @@ class ColourVideo(SensorRecording):
     size: tuple[int, int]
     image: Callable[[int], NDArray]
     source: str = ""
+    notes: tuple[str, ...] = ()
     _kind: ClassVar[type[ColourFrame] | type[SilhouetteFrame]] = ColourFrame
 
     def frame(self, i: int) -> ColourFrame | SilhouetteFrame:
@@ -192,6 +195,8 @@ class DepthVideo(SensorRecording):
         Whether everything but the body is already removed.
     source : str
         File or folder, for messages.
+    notes : tuple of str
+        What the reader has to say of the files.
 
     Raises
     ------
@@ -207,6 +212,7 @@ class DepthVideo(SensorRecording):
     background: DepthVideo | None = None
     on_body: bool = False
     source: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -261,6 +267,8 @@ class CloudVideo(SensorRecording):
     segment : str or None
         The body segment of all points, if known.
     source : str
+    notes : tuple of str
+        What the reader has to say of the files.
 
     Raises
     ------
@@ -276,6 +284,7 @@ class CloudVideo(SensorRecording):
     on_body: bool = False
     segment: str | None = None
     source: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()

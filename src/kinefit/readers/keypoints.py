@@ -18,7 +18,9 @@ from kinefit._mapped import kept
 from kinefit.errors import FileError, ObservationError, choices, names_file
 from kinefit.observations import Keypoints
 from kinefit.observations.arrays import sealed
+from kinefit.observations.clocks import frames_by_name
 from kinefit.readers import keypoint_sets
+from kinefit.readers.depth.images import natural
 from kinefit.readers.keypoint_sets import (
     FACE_POINTS,
     HAND_POINTS,
@@ -290,32 +292,21 @@ def _numbered_files(folder: Path) -> list[Path]:
     if not folder.is_dir():
         remedy = 'Name the folder, not one of its files; .npy files are of format = "mediapipe", .csv of "caliscope".'
         raise FileError("no such folder of json files", remedy=remedy)
-    numbered: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() != ".json":
-            continue
-        match = _FRAME_NUMBER.search(path.name)
-        if not match:
-            keypoint_sets.refuse_other_keypoints(path)
-            raise ObservationError("no frame number in this name", file=path, remedy="Expected NAME_0012.json.")
-        number = int(match[1])
-        if number in numbered:
-            problem = f"frame {number} appears twice, also as {numbered[number].name}"
-            raise ObservationError(problem, file=path, remedy="Keep one camera in each folder.")
-        numbered[number] = path
-    if not numbered:
+    files = sorted((p for p in folder.iterdir() if p.suffix.lower() == ".json"), key=lambda path: natural(path.name))
+    if not files:
         remedy = "Name the folder that the detector wrote for this camera."
         raise FileError("there are no json files in this folder", remedy=remedy)
-    first, last = min(numbered), max(numbered)
-    count = last - first + 1 - len(numbered)
-    if count:
-        missing = next(i for i in range(first, last) if i not in numbered)
-        before = numbered[missing - 1]
-        raise ObservationError(
-            f"{count} of the frames {first} to {last} are missing, the first is {missing}",
-            place=f"after {before.name}", remedy="Run the detector again with one file per frame, also for empty ones.",
-        )
-    return [numbered[i] for i in range(first, last + 1)]
+    for path in files:
+        if not _FRAME_NUMBER.search(path.name):
+            keypoint_sets.refuse_other_keypoints(path)
+            raise ObservationError("no frame number in this name", file=path, remedy="Expected NAME_0012.json.")
+    numbered = frames_by_name([path.name.lower().replace("_keypoints", "") for path in files], "frames")
+    numbered.refuse_gaps("frames")
+    if numbered.step > 1 or numbered.times is not None:
+        problem = f"its files are not numbered by one: {files[0].name} and {files[1].name}"
+        remedy = "Run the detector on every frame, or number the files by one and give the rate of these frames."
+        raise ObservationError(problem, remedy=remedy)
+    return files
 
 
 def _read_people(path: Path) -> list[OpenPosePerson]:

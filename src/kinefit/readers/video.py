@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -12,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._pictures import read_picture
-from kinefit.errors import FileError, ObservationError, choices
-from kinefit.observations.clocks import frame_times, is_even, steps_of, unevenness
+from kinefit.errors import FileError, ObservationError, choices, located
+from kinefit.observations.clocks import frame_times, frames_by_name, is_even, steps_of, unevenness
 from kinefit.readers.depth.images import listed
 from kinefit.readers.ros.images import McapVideo
 from kinefit.readers.ros.recordings import inside
@@ -77,8 +76,8 @@ class Video:
 
     @property
     def unevenness(self) -> str:
-        """Description of a varying frame rate, such as "variable frame rate, 60 Hz nominal, ..."; "" if constant."""
-        return unevenness(self.times, self.rate)
+        """What is worth saying of the times: "variable frame rate, 60 Hz nominal, ...", or what names state."""
+        return self._source.note or unevenness(self.times, self.rate)
 
     def frame_at(self, time: float) -> int | None:
         """Number of the frame nearest to a time [s] from the first frame; None if half a frame or more outside."""
@@ -219,7 +218,6 @@ def common_frames(
 
 
 ENDINGS = (".png", ".jpg", ".jpeg")
-_MAX_NUMBER_STEP = 1.5  # of the numbers in two names, in median steps: with more an image is missing
 
 
 class ImageFolder:
@@ -246,8 +244,11 @@ class ImageFolder:
         if rate is None or not 0 < rate < 1e6:
             problem = "a folder of images states no frame rate"
             raise ObservationError(problem, file=path, remedy="Write rate = ... (frames per second) into [take].")
-        _check_numbers(files)
+        with located(path, None):
+            numbered = frames_by_name([file.name for file in files], "images")
+            numbered.refuse_gaps("images")
         self._files, self.rate = files, float(rate)
+        self.times, self.note = numbered.on_clock(self.rate, "images")  # (N,) [s] from the first frame
         self._latest: tuple[int, NDArray[np.uint8]] = (0, read_picture(files[0]))
         self.size: tuple[int, int] = self._latest[1].shape[1::-1]
 
@@ -256,11 +257,6 @@ class ImageFolder:
 
     def close(self) -> None:
         """Do nothing: no file stays open."""
-
-    @property
-    def times(self) -> NDArray:
-        """(N,) [s] from the first frame."""
-        return np.arange(len(self)) / self.rate
 
     def image(self, i: int) -> NDArray[np.uint8]:
         """Frame `i` as (H, W, 3) uint8 RGB; raises FileError for a damaged image, or one of another size."""
@@ -277,22 +273,3 @@ class ImageFolder:
 def images_in(path: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
     """Image files of a folder or a pattern, in the order of the numbers in their names."""
     return [file for file in listed(path) if file.suffix.lower() in endings]
-
-
-def _check_numbers(files: list[Path]) -> None:
-    numbers = [re.findall(r"\d+", file.stem)[-1:] for file in files]
-    if not all(numbers):
-        return
-    steps = np.diff([float(number[0]) for number in numbers])
-    if len(steps) and (steps <= 0).any():
-        i = int(np.argmax(steps <= 0))
-        raise ObservationError(
-            f"two images with one number: {files[i].name} and {files[i + 1].name}", file=files[0].parent,
-            remedy="Name those of this camera by a pattern: video = \"folder/left_*.png\".",
-        )  # fmt: skip
-    if len(steps) and (steps > _MAX_NUMBER_STEP * np.sort(steps)[(len(steps) - 1) // 2]).any():
-        i = int(np.argmax(steps))
-        raise ObservationError(
-            f"images are missing between {files[i].name} and {files[i + 1].name}", file=files[0].parent,
-            remedy="Copy them again, or remove all later images, or number them without a gap.",
-        )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +22,11 @@ _MAX_SKIPPED_FRAMES = 64  # decoded and dropped; over more, seeking is faster
 _MIN_CHUNKS_SHARE = 0.9  # of an AVI that its chunks fill; an unfinished one has a size of 0 there
 _CODECS_WITH_HIDDEN_FRAMES = ("vp8",)  # their packets cannot be counted: some show nothing
 _MIN_MPEG4_BYTES = 10  # of a frame; less says only that it repeats the one before, and nothing is decoded
+_CAPTURE_RATE = "com.android.capture.fps"
+_MAX_CAPTURE_ERROR = 0.1  # of the stored rate: a telephone's rate varies
+_MIN_SLOW_MOTION_HZ = 100.0  # telephones capture it at 120 or more; at 60 Hz they leave out frames where it is dark
+_MAX_TIME_LAPSE = 0.6  # of the stored rate
+_TIME_CODE = re.compile(r"(\d\d):(\d\d):(\d\d)([:;.])(\d\d)")
 _REMEDY = "Copy the file again from its source, or re-encode it."
 
 
@@ -44,6 +50,15 @@ class VideoFile:
         self.size: tuple[int, int] = size[::-1] if self._display[0] else size
         self.times: NDArray = (np.array(shown) - shown[0]) * float(self._stream.time_base or 0)
         self.rate: float = self._measure_rate()
+        self.note = ""
+        captured = _capture_rate(self._container)
+        if captured is not None and abs(captured / self.rate - 1.0) > _MAX_CAPTURE_ERROR:
+            stated = f"captured at {captured:.6g} Hz as the file states ({_CAPTURE_RATE}), stored at {self.rate:.6g} Hz"
+            self.note = f"{stated}: times are those of playing; frames left out in the dark and slow motion look alike"
+            if captured < _MAX_TIME_LAPSE * self.rate or captured > max(_MIN_SLOW_MOTION_HZ, 1.9 * self.rate):
+                kind = "slow motion" if captured > self.rate else "time lapse"
+                self.note = f"{kind}: {stated}; times are those of the capture"
+                self.times, self.rate = self.times * (self.rate / captured), captured
         self._restart()
 
     def __len__(self) -> int:
@@ -96,6 +111,39 @@ class VideoFile:
             raise FileError("the video states no frame rate", file=self.path, remedy="Give it: ffmpeg -r RATE -i ...")
         even = (rate for rate in (stated, measured) if rate and is_even(self.times, rate))
         return next(even, 0.0) or nominal_rate(self.times)
+
+
+def _capture_rate(container: Any) -> float | None:
+    """Rate [Hz] at which a telephone captured the frames, as the file states it; None where it does not."""
+    try:
+        rate = float(container.metadata.get(_CAPTURE_RATE, "nan"))
+    except ValueError:
+        return None
+    return rate if 0.0 < rate < 1e5 else None
+
+
+def stated_time_code(path: Path, rate: float) -> tuple[float, str] | None:
+    """Time [s] and text of the first frame's time code; None of a video file without one.
+
+    Parameters
+    ----------
+    rate : float [Hz] of the video. Codes count whole frames of the next whole rate, so that their seconds last longer
+        at 29.97 Hz; drop-frame codes (29.97 and 59.94 Hz, with a semicolon) leave out numbers to make up for that.
+    """
+    if not path.is_file():
+        return None
+    with _open(path) as container:
+        holders = [stream.metadata for stream in container.streams] + [container.metadata]
+        text = next((found["timecode"] for found in holders if "timecode" in found), "")
+    parts = _TIME_CODE.fullmatch(text)
+    if parts is None:
+        return None
+    hours, minutes, seconds, frames = (int(parts[k]) for k in (1, 2, 3, 5))
+    count = ((60 * hours + minutes) * 60 + seconds) * round(rate) + frames
+    if parts[4] in ";.":
+        whole = 60 * hours + minutes
+        count -= round(rate / 15.0) * (whole - whole // 10)
+    return count / rate, text
 
 
 def first_image(path: Path) -> NDArray[np.uint8]:

@@ -9,6 +9,7 @@ from kinefit._arguments import checked
 from kinefit.bodies import load_body
 from kinefit.calibration.sensors import fit_sensors
 from kinefit.diagnostics.checks import CHECKS, Check, Checked, Progress, run
+from kinefit.diagnostics.depth import UNCHECKED, depth_findings
 from kinefit.diagnostics.images import finding_of
 from kinefit.diagnostics.quick import inverted_findings
 from kinefit.diagnostics.sensors import sensor_findings
@@ -62,8 +63,7 @@ def _depth_alone(c: Checked) -> list[Finding]:
     """Depth cameras alone: an upside-down image of the person."""
     if not c.observations.depth or c.take.cameras or c.take.markers:
         return []
-    text = "Depth alone: the poses of its cameras are not checked."
-    found = [Finding("note", "load", text, remedy="Add videos of two cameras, whose keypoints show the person.")]
+    found = [Finding("note", "load", UNCHECKED, remedy="Add videos of two cameras, whose keypoints show the person.")]
     try:
         recording, body = recording_of(c.take, c.observations, load_body(c.take.body))
         person = sized_by_depth(SizedPerson(recording, Subject.as_is(body)))
@@ -106,6 +106,11 @@ ALL_CHECKS = (
     Check(
         "labels of markers", _labels, ("take", "observations"), 2.0,
         "Exchanged sides and a mirrored world look the same; markers placed elsewhere look like exchanged labels.",
+    ),
+    Check(
+        "unit and lens of depth cameras", lambda c: depth_findings(c.take, c.observations.depth),
+        ("take", "observations"), 1.0,
+        "Wrong focal lengths, people side by side, an image cropped on one side and a round room look the same.",
     ),
     Check(
         "depth cameras alone", _depth_alone, ("take", "observations"), 20.0,

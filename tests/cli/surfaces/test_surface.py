@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 from tests.photogrammetry import scenes
 
+from kinefit.cli.surfaces._measure import in_number_order
 from kinefit.cli.surfaces.surface import surface
 from kinefit.errors import CalibrationError, FileError, ObservationError
 from kinefit.geometry import se3
@@ -275,3 +277,11 @@ def test_interlaced_photographs_and_seeds_of_too_few_columns(folder, tmp_path):
     (tmp_path / "seeds.csv").write_text("1,2,3\n")
     told = call(folder / "calib.toml", *views, "--seeds", tmp_path / "seeds.csv", "-o", tmp_path / "out")
     assert isinstance(told.exception, FileError) and "3 columns, not 4" in str(told.exception)
+
+
+def test_photographs_by_a_shell_s_pattern_are_in_the_order_of_their_numbers():
+    by_shell = [Path(f"load_{k}.png") for k in (0, 1, 10, 11, 2)]
+    assert [path.stem for path in in_number_order(by_shell)] == [f"load_{k}" for k in (0, 1, 2, 10, 11)]
+    chosen = [Path(f"load_{k}.png") for k in (3, 1, 2)]
+    assert in_number_order(chosen) == chosen  # as somebody put them
+    assert in_number_order([Path("after.png"), Path("before.png")])[0] == Path("after.png")

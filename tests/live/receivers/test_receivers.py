@@ -5,6 +5,7 @@ import queue
 import re
 import socket
 import time
+from dataclasses import replace
 from urllib.request import urlopen
 
 import numpy as np
@@ -254,8 +255,15 @@ def test_laboratories_get_angles_and_joints(scene, played):
         pytest.skip("no network on which LSL finds streams")
     inlet = pylsl.StreamInlet(found[0])
     inlet.open_stream(timeout=5.0)
-    outlet.pose(played.poses[-1], b"")
-    sample, _ = inlet.pull_sample(timeout=5.0)
+    sent = pylsl.local_clock()
+    outlet.pose(replace(played.poses[-1], latency=0.25), b"")
+    sample, stamp = inlet.pull_sample(timeout=5.0)
+    assert stamp == pytest.approx(sent - 0.25, abs=0.1)  # when it was measured, not when it was sent
+    assert inlet.info().nominal_srate() == pylsl.IRREGULAR_RATE  # else readers space samples evenly over dropped steps
+    sampling = inlet.info().desc().child("sampling")
+    assert (sampling.child_value("step_rate"), sampling.child_value("missing_samples")) == (
+        "30", "person not found, or step dropped"
+    )  # fmt: skip
     state = played.poses[-1].result.state
     slides = scene.motion.body.tree.prismatic
     assert np.allclose(sample[: len(state.angles)], np.where(slides, 1.0, np.degrees(1.0)) * state.angles)

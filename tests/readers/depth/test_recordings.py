@@ -1,6 +1,7 @@
 """Recordings of depth: every format gives the same frames, and what is wrong with one is said."""
 
 import json
+import re
 import struct
 import sys
 import types
@@ -22,7 +23,7 @@ COUNTS[:, :5] = 0
 METRES = COUNTS * np.float32(0.001)
 
 
-def png(folder, names=("f8.png", "f9.png", "f10.png", "f11.png", "f100.png"), counts=COUNTS):
+def png(folder, names=("f8.png", "f9.png", "f10.png", "f11.png", "f12.png"), counts=COUNTS):
     folder.mkdir(parents=True, exist_ok=True)
     for name, image in zip(names, counts):
         cv2.imwrite(str(folder / name), image)
@@ -346,3 +347,60 @@ def test_real_recordings(data_dir):
     assert 0.5 < np.median(video.frame(0).depth[video.frame(0).depth > 0]) < 1.0
     with pytest.raises(ObservationError, match="nothing lies within the range"):
         read_depth(folder, unit=0.000125, range=(2, 4))
+
+
+WALL = np.tile(np.linspace(2.0, 3.0, 64), (48, 1))  # [m]
+
+
+@pytest.mark.parametrize(("counts", "unit", "said"), [
+    (1000 * WALL, 0.001, ""),
+    (8 * np.rint(1000 * WALL), 0.000125, "multiples of 8.*8 mm would be 0.001"),
+    (8 * np.rint(1000 * WALL) + (np.arange(64) > 50) * 3, 0.000125, "multiples of 8"),  # a person's number
+    (5000 * WALL, 0.001, "median is 12.5 m.*A hall looks so.*0.0002"),
+])  # fmt: skip
+def test_a_unit_that_no_file_states_is_found_or_doubted(tmp_path, counts, unit, said):
+    video = read_depth(png(tmp_path / "d", [f"{i}.png" for i in range(3)], np.rint([counts] * 3).astype(np.uint16)))
+    assert np.allclose(video.frame(0).depth, np.rint(counts) * unit, rtol=1e-5)
+    assert re.search(said, " ".join(video.notes)) and bool(said) == bool(video.notes)
+    assert not read_depth(tmp_path / "d", unit=0.0002).notes  # stated
+
+
+def test_a_list_beside_states_the_unit_and_names_are_times(tmp_path):
+    names = [f"1305031102.{k}60407.png" for k in range(1, 5)]
+    png(tmp_path / "depth", names, np.rint([5000 * WALL] * 4).astype(np.uint16))
+    (tmp_path / "depth.txt").write_text("# timestamp filename\n1305031102.160407 depth/1305031102.160407.png\n")
+    video = read_depth(tmp_path / "depth", rate=30.0)  # of the camera, of which every third frame is there
+    assert np.allclose(video.frame(0).depth, WALL, atol=1e-3) and np.allclose(np.diff(video.times), 0.1, atol=1e-5)
+    assert abs(video.rate - 10.0) < 0.01 and "unit = 0.0002 is taken" in " ".join(video.notes)
+    assert np.allclose(read_depth(tmp_path / "depth", time_unit=1.0).times, 0.1 * np.arange(4))
+    with pytest.raises(ObservationError, match="give 10 Hz, not 25 Hz"):
+        read_depth(tmp_path / "depth", rate=25.0)
+
+
+@pytest.mark.parametrize(("kind", "said"), [("<f2", "float16"), ("<f4", "float32"), ("<u2", "")])
+def test_raw_numbers_are_counts_or_metres(tmp_path, kind, said):
+    (tmp_path / "d").mkdir()
+    for i in range(3):
+        (WALL if "f" in kind else 1000 * WALL).astype(kind).tofile(tmp_path / "d" / f"{i}.bin")
+    video = read_depth(tmp_path / "d", size=SIZE)
+    assert np.allclose(video.frame(2).depth, WALL, atol=2e-3)
+    assert said in " ".join(video.notes) and bool(said) == bool(video.notes)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1000.0])
+def test_one_numpy_file_a_frame(tmp_path, scale):
+    for i in range(3):
+        np.save(tmp_path / f"{5 * i}.npy", (scale * WALL).astype(np.float32 if scale == 1.0 else np.uint16))
+    video = read_depth(tmp_path)
+    assert np.allclose(video.frame(2).depth, WALL, atol=1e-3) and np.allclose(video.times, np.arange(3) / 6.0)
+    np.save(tmp_path / "9.npy", np.zeros(4))
+    with pytest.raises(ObservationError, match=r"shape \(4,\).*\(height, width\)"):
+        read_depth(tmp_path / "9.npy")
+
+
+def test_noise_is_doubted_and_clouds_step_too(tmp_path):
+    assert "infrared" in " ".join(read_depth(png(tmp_path / "a")).notes)
+    for i in (0, 3, 6):
+        cloud(tmp_path / f"c{i}.pcd", np.random.default_rng(i).normal((0, 0, 2), 0.1, (20, 3)), 20)
+    clouds = read_clouds(tmp_path / "c*.pcd", rate=30.0)
+    assert np.allclose(clouds.times, [0.0, 0.1, 0.2]) and "step by 3" in clouds.notes[0]

@@ -6,6 +6,7 @@ from dataclasses import replace
 from fractions import Fraction
 
 import av
+import cv2
 import numpy as np
 import pytest
 
@@ -468,7 +469,7 @@ def test_what_kinefit_left_is_no_recording(folder, rig):
 
 def test_an_empty_folder_and_none(folder):
     (folder / "readme.txt").write_text("nothing")
-    with pytest.raises(TakeError, match="no videos, keypoints, markers or recordings among 1 files"):
+    with pytest.raises(TakeError, match="no videos, keypoints, markers, depth or recordings among 1 files"):
         guess_take(folder)
     with pytest.raises(TakeError, match="no such folder"):
         guess_take(folder / "none")
@@ -595,4 +596,125 @@ def test_videos_of_one_name_are_not_mixed(folder):
     for place in ("one", "two"):
         write_video(folder / place / "cam.mp4")
     with pytest.raises(TakeError, match="two videos are called cam.*Name the folder of one recording"):
+        guess_take(folder)
+
+
+NUMBERED = ("cam1/IMG_0001.mp4", "cam1/IMG_0002.mp4", "cam2/IMG_0002.mp4", "cam2/IMG_0003.mp4")
+
+
+def test_folders_are_cameras_that_count_their_own_files(folder, rig):
+    write_videos(folder, NUMBERED, frames=5)
+    write_calibration(renamed(Rig(rig.cameras[:2]), ("cam1", "cam2")), folder / "calib.toml")
+    take, _, guess = taken(folder)
+    assert [c.video.relative_to(folder).as_posix() for c in take.cameras] == [NUMBERED[0], NUMBERED[2]]
+    assert any("another recording" in note.text for note in guess.notes)
+    found, _ = trials([folder / name for name in NUMBERED], folder, ("cam1", "cam2"))
+    assert [[p.name for p in t.files.values()] for t in found] == [["IMG_0001.mp4", "IMG_0002.mp4"],
+                                                                  ["IMG_0002.mp4", "IMG_0003.mp4"]]  # fmt: skip
+    assert {t.how for t in found} == {"nth"}
+    found, _ = trials([folder / name for name in NUMBERED[:3]], folder, ("cam1", "cam2"))
+    assert {t.how for t in found} == {"uneven"} and [len(t.files) for t in found] == [2, 1]
+    (folder / "calib.toml").unlink()
+    without = guess_take(folder)
+    assert NUMBERED[0] in without.text and NUMBERED[2] in without.text and NUMBERED[1] not in without.text
+    assert any("cam1/IMG_0002.mp4: a later recording" in note.text for note in without.notes)
+
+
+def test_names_of_trials_in_folders_of_cameras_stay_names(folder):
+    paths = [folder / camera / f"{trial}.mp4" for camera, some in (("cam1", ("run", "walk")), ("cam2", ("walk",)))
+             for trial in some]  # fmt: skip
+    found, _ = trials(paths, folder, ("cam1", "cam2"))
+    assert {t.place: len(t.files) for t in found} == {"*/walk": 2, "*/run": 1}
+
+
+@pytest.mark.parametrize("names", [
+    ("GX010123.MP4", "GX020123.MP4"), ("GOPR0123.mp4", "GP010123.mp4", "GP020123.mp4"),
+    ("GH030001.mp4", "GH040001.mp4"),
+])  # fmt: skip
+def test_chapters_are_one_camera(folder, names):
+    write_videos(folder, names, frames=5)
+    guess = guess_take(folder)
+    assert names[0] in guess.text and not any(name in guess.text for name in names[1:])
+    told = notes(guess, "video")
+    assert all(f"{name}: a later chapter of {names[0]}" in told for name in names[1:]) and "concat" in told
+
+
+def test_depth_of_a_folder_and_of_a_track(folder):
+    (folder / "k").mkdir()
+    image = np.tile(np.linspace(2000, 3000, 64), (48, 1)).astype(np.uint16)
+    for i in range(3):
+        cv2.imwrite(str(folder / "k" / f"{i}.png"), image)
+    guess = guess_take(folder)
+    assert 'file = "k"' in guess.text and "3 depth images of 64x48 px" in guess.text and "# intrinsics" in guess.text
+    with av.open(str(folder / "rec.mkv"), "w") as container:
+        for title, codec, pixels in (("COLOR", "mjpeg", "yuvj420p"), ("DEPTH", "ffv1", "gray16le")):
+            stream = container.add_stream(codec, rate=30)
+            (stream.width, stream.height), stream.pix_fmt, stream.metadata["title"] = (64, 48), pixels, title
+        for _ in range(3):
+            pictures = (np.zeros((48, 64, 3), np.uint8), "rgb24"), (image, "gray16le")
+            for stream, (picture, kind) in zip(container.streams, pictures, strict=True):
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format=kind)))
+        for stream in container.streams:
+            container.mux(stream.encode())
+    both = guess_take(folder)
+    assert '[[depth]]\nname = "rec"\nfile = "rec.mkv"' in both.text and '# name = "k"' in both.text
+    write_video(folder / "phone.mp4", frames=5)
+    beside = guess_take(folder)
+    assert '# [[depth]]\n# name = "rec"' in beside.text and "[[camera]]" in beside.text
+
+
+@pytest.mark.parametrize(("name", "said"), [
+    (".IMG_0001.MOV.icloud", "iCloud"), ("session.zip", "an archive"), ("VID.insv", "360°"),
+    ("v.mp4.crdownload", "not finished"), ("one.png", "one depth image"),
+])  # fmt: skip
+def test_what_stands_in_place_of_a_recording_is_named(folder, name, said):
+    (folder / name).write_bytes(b"x")
+    if name == "one.png":
+        cv2.imwrite(str(folder / name), np.tile(np.linspace(2000, 3000, 64), (48, 1)).astype(np.uint16))
+    with pytest.raises(TakeError, match=rf"no videos.*{re.escape(name)}.*{said}"):
+        guess_take(folder)
+    write_video(folder / "phone.mp4", frames=5)
+    assert said in notes(guess_take(folder))
+
+
+def test_masks_of_16_bits_are_no_depth(folder):
+    for i in range(3):
+        mask = np.zeros((48, 64), np.uint16)
+        mask[10:20] = 65535
+        cv2.imwrite(str(folder / f"mask_{i}.png"), mask)
+    with pytest.raises(TakeError, match="no videos.* among 3 files\\."):
+        guess_take(folder)
+
+
+def test_time_codes_are_offsets_where_all_state_them(folder):
+    def write_code(name, code, frames=60):
+        with av.open(str(folder / name), "w") as container:
+            stream = container.add_stream("mpeg4", rate=30)
+            stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+            stream.metadata["timecode"] = code
+            for _ in range(frames):
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8))))
+            container.mux(stream.encode())
+
+    write_code("a.mov", "10:00:00:00")
+    write_code("b.mov", "10:00:00:15")
+    guess = guess_take(folder)
+    (folder / "take.toml").write_text(guess.text)
+    assert [c.time_offset for c in read_take(folder / "take.toml").cameras] == [0.0, 0.5]
+    assert any("by its time code" in note.text for note in guess.notes)
+    write_code("b.mov", "12:00:00:15")  # a clock that nobody set
+    assert "time_offset" not in guess_take(folder).text
+    write_video(folder / "b.mov", frames=60)
+    assert "time_offset" not in guess_take(folder).text
+
+
+def test_numpy_files_are_depth_where_they_hold_images(folder):
+    image = np.tile(np.linspace(2.0, 3.0, 64, dtype=np.float32), (48, 1))
+    np.save(folder / "walk.npy", np.stack([image] * 4))
+    assert 'file = "walk.npy"' in guess_take(folder).text and "4 depth images" in notes(guess_take(folder))
+    np.save(folder / "walk.npy", image)
+    with pytest.raises(TakeError, match=r"walk.npy: one depth image"):
+        guess_take(folder)
+    np.save(folder / "walk.npy", np.random.default_rng(0).random((90, 33, 4)))  # points of somebody's program
+    with pytest.raises(TakeError, match=r"among 1 files\."):
         guess_take(folder)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import CalibrationError, FileError, ObservationError, TakeError
-from kinefit.readers.take.file import read_take
+from kinefit.readers.take.file import find_take, read_take
 from kinefit.readers.take.load import load_observations
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
@@ -308,7 +308,7 @@ def test_a_damaged_video_is_refused(small):
 def test_a_path_whose_backslashes_were_read_as_tabs_is_told(tmp_path):
     take = tmp_path / "take.toml"
     take.write_text('[calibration]\nfile = "C:\\temp\\new.toml"\n')
-    with pytest.raises(TakeError, match=r"forward slashes, or single quotes"):
+    with pytest.raises(TakeError, match=r"use forward slashes"):
         read_take(take)
 
 
@@ -339,3 +339,23 @@ def test_units_of_calibrations_are_spelled_as_people_do(small, unit):
     far = load(small, take_text()).rig
     near = load(small, take_text().replace("[calibration]\n", f"[calibration]\nunit = {unit}\n")).rig
     np.testing.assert_allclose(near["a"].T_camera_world[:3, 3], 0.001 * far["a"].T_camera_world[:3, 3])
+
+
+def test_paths_of_windows_are_those_of_every_system(tmp_path):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "m.trc").write_text("x")
+    head = '[take]\nup = "y"\nrate = 30.0\n[[markers]]\n'
+    assert read_take(written(tmp_path, f"{head}file = 'data\\m.trc'\n")).markers[0].file == tmp_path / "data" / "m.trc"
+    with pytest.raises(FileError, match=r"data.gone.trc"):
+        read_take(written(tmp_path, f"{head}file = 'data\\gone.trc'\n"))
+    with pytest.raises(FileError, match=r'Write "data/m.trc"'):
+        read_take(written(tmp_path, f'{head}file = "data\\m.trc"\n'))
+
+
+def test_take_toml_in_any_case_and_what_is_no_take(tmp_path):
+    written(tmp_path, '[take]\n[[markers]]\nfile = "m.trc"\n', "Take.TOML")
+    written(tmp_path, '[take]\n[[markers]]\nfile = "m.trc"\n', "a.toml")
+    assert find_take(tmp_path).name == "Take.TOML"
+    for name, said in (("s.zip", "an archive"), ("v.MOV.icloud", "iCloud"), ("v.360", "360°")):
+        with pytest.raises(FileError, match=said):
+            find_take(tmp_path / name)

@@ -1,9 +1,13 @@
 """Silhouettes in files and in takes."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from kinefit.cli import main
 from kinefit.errors import FileError, ObservationError, TakeError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.readers.take.file import read_take
@@ -136,3 +140,64 @@ def test_keypoints_of_some_frames_only(tmp_path):
     assert np.isnan(seen.points[1:]).all() and (seen.confidence[1:] == 0).all()
     with pytest.raises(TakeError, match="frames"):
         read_take(take(tmp_path, keypoints.replace("[0, 1]", "[2, 1]")))
+
+
+BODY = np.zeros((48, 64), np.uint8)
+BODY[8:40, 20:36] = 255
+
+
+@pytest.mark.parametrize(("image", "said"), [
+    (np.where(BODY > 0, 2, 0).astype(np.uint8), "values 0 and 2"),
+    (np.where(BODY > 0, np.arange(64) // 28 + 1, 0).astype(np.uint8), "values 0 and 1, 2"),  # two people
+    (np.where(BODY > 0, 24, 0).astype(np.uint16), ""),
+    (cv2.merge([BODY, BODY, BODY, np.full_like(BODY, 255)]), ""),  # opaque
+    (cv2.merge([255 - BODY] * 3 + [BODY]), ""),  # the alpha channel is the mask
+    (np.where(BODY[..., None] > 0, (0, 0, 128), 0).astype(np.uint8), r"\[0, 0, 0\]"),  # the palette of DAVIS
+    (np.where(BODY[..., None] > 0, (30, 20, 200), 255).astype(np.uint8), r"\[255, 255, 255\]"),
+    (cv2.GaussianBlur(BODY, (0, 0), 0.8), ""),
+    (BODY[::2, ::2], "32x24 px: scaled to 64x48"),
+])  # fmt: skip
+def test_the_body_is_found_by_values_colours_and_size(tmp_path, image, said):
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), image)
+    video = read_silhouettes(tmp_path, camera="c", rate=30.0, size=(64, 48))
+    assert np.mean((video.frame(1).mask > 127) != (BODY > 0)) < 0.03
+    assert re.search(said, " ".join(video.notes)) and bool(said) == bool(video.notes)
+
+
+@pytest.mark.parametrize(("image", "said"), [
+    (255 - BODY, "white covers 83 %.*inverted"),
+    (cv2.merge([255 - BODY] * 3 + [np.full_like(BODY, 255)]), "inverted"),
+    (np.where(BODY > 0, 24, 7).astype(np.uint8), "labels of all"),
+    (np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8), "photographs"),
+    (np.random.default_rng(0).integers(0, 255, (48, 64)).astype(np.uint8), "grey values"),
+    (BODY[:, 8:56], "48x48 px, not 64x48"),
+])  # fmt: skip
+def test_what_is_no_mask_is_named_when_it_is_loaded(tmp_path, image, said):
+    cv2.imwrite(str(tmp_path / "0.png"), image)
+    with pytest.raises(ObservationError, match=said):
+        read_silhouettes(tmp_path, camera="c", rate=30.0, size=(64, 48))
+
+
+def test_masks_of_some_frames_of_a_video_are_at_their_numbers(tmp_path):
+    clock = np.arange(20) / 30.0
+    for i in range(5, 14, 2):
+        cv2.imwrite(str(tmp_path / f"{i:04d}.png"), BODY)
+    video = read_silhouettes(tmp_path, camera="c", rate=30.0, size=(64, 48), clock=clock)
+    np.testing.assert_allclose(video.times, clock[5:14:2])
+    assert video.notes == ("5 masks of the video's 20 frames, by their numbers",)
+    (tmp_path / "0005.png").rename(tmp_path / "0020.png")  # numbers that end with the video's count begin at 1
+    video = read_silhouettes(tmp_path, camera="c", rate=30.0, size=(64, 48), clock=clock)
+    np.testing.assert_allclose(video.times, clock[[6, 8, 10, 12, 19]])
+
+
+def test_a_take_and_its_check_say_how_masks_were_read(tmp_path):
+    write_masks(tmp_path / "m", value=2)
+    for i in (2, 1):
+        (tmp_path / "m" / f"{i:03d}.png").rename(tmp_path / "m" / f"{4 * i:03d}.png")
+    path = take(tmp_path, '[[silhouette]]\ncamera = "cam1"\nfile = "m"\n')
+    seen = load_observations(read_take(path))
+    assert seen.frames == (0, 9)
+    done = CliRunner().invoke(main, ["check", str(path)])
+    told = " ".join(done.output.split())
+    assert "cam1: the numbers of its masks step by 4" in told and "the values 0 and 2: all but 0 is taken" in told

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -37,6 +38,7 @@ from kinefit.photogrammetry.surface import MeasuredSurface
 from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
 from kinefit.photogrammetry.trajectories import Trajectories, filtered
 from kinefit.readers.calibration.read import read_calibration
+from kinefit.readers.depth.images import natural
 from kinefit.readers.motion import read_motion
 from kinefit.readers.video import Video, images_in
 
@@ -233,6 +235,7 @@ def measure_one_camera(photographs: Sequence[Path], millimetres: float, wanted: 
         given = ", ".join(named) or ("--seeds" if wanted.seeds else "one photograph")
         problem = f"--flat does not work with {given}"
         raise ObservationError(problem, remedy="Give only photographs of one camera, before and after.")
+    as_given, photographs = photographs, in_number_order(photographs)
     states = [spline_of(read_photograph(path), wanted.field, wanted.smooth) for path in photographs]
     grid = Grid.of(states[0].size, wanted.step, mask=mask_of(wanted.mask, wanted.field))
     window = wanted.side(states[0], states[1], grid)
@@ -240,7 +243,15 @@ def measure_one_camera(photographs: Sequence[Path], millimetres: float, wanted: 
         states, grid, millimetres / 1e3, window=window, incremental=wanted.incremental,
         least=MIN_CORRELATION if wanted.least is None else wanted.least,
     )  # fmt: skip
-    return _write_all(surfaces, photographs, wanted, int(np.max(window)))
+    reordered = ["photographs in the order of their numbers, not of the shell's pattern"] * (as_given != photographs)
+    return reordered + _write_all(surfaces, photographs, wanted, int(np.max(window)))
+
+
+def in_number_order(photographs: Sequence[Path]) -> Sequence[Path]:
+    """Photographs as given; in the order of their numbers where a shell's pattern puts load_10 before load_2."""
+    alike = len({re.sub(r"\d+", "#", str(path)) for path in photographs}) == 1
+    by_shell = list(photographs) == sorted(photographs, key=str)
+    return sorted(photographs, key=lambda path: natural(str(path))) if alike and by_shell else photographs
 
 
 def _write_all(
@@ -250,7 +261,8 @@ def _write_all(
     lines = []
     for k, surface in enumerate(surfaces):
         reference = surfaces[max(k - 1, 0) if wanted.incremental else 0] if k else None
-        lines += _write(surface, reference, _grey(photographs[k], wanted.field), wanted, k, window)
+        state = _write(surface, reference, _grey(photographs[k], wanted.field), wanted, k, window)
+        lines += [f"{state[0]} ({photographs[k].name})", *state[1:]]
     return lines
 
 

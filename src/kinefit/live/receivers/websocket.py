@@ -351,7 +351,10 @@ class JsonLines:
 class Lsl:
     """Two outlets: NAME-angles [deg, of sliding coordinates m] and NAME-joints [m], each with standard deviations.
 
-    Unobserved coordinates have the standard deviation inf; while the person is not found, nothing is sent.
+    Unobserved coordinates have the standard deviation inf. While the person is not found, and for steps that the
+    session drops, nothing is sent: the streams have no nominal rate, so that readers take the samples' own time stamps.
+    These are the times at which the newest frame of the step arrived, on LSL's clock. The streams' description states
+    the rate of the steps (`sampling/step_rate`).
 
     Raises
     ------
@@ -387,8 +390,9 @@ class Lsl:
         f = self._factor
         angles = np.concatenate([f * r.state.angles, f * r.dof_std[6:]])
         joints = np.concatenate([posed.Ts_world_segment[:, :3, 3].ravel(), r.joint_std.ravel()])
+        measured = self._lsl.local_clock() - getattr(posed, "latency", 0.0)  # [s]; 0 for poses of other programs
         for outlet, sample in zip(self._outlets, (angles, joints)):
-            outlet.push_sample(sample.tolist())
+            outlet.push_sample(sample.tolist(), measured)
 
     def close(self) -> None:
         """End the streams."""
@@ -396,7 +400,12 @@ class Lsl:
 
     def _outlet(self, kind: str, columns: list[tuple[str, str]]) -> Any:
         name = f"{self.name}-{kind}"
-        info = self._lsl.StreamInfo(name, "MoCap", len(columns), self.rate, "double64", f"kinefit-{name}")
+        irregular = self._lsl.IRREGULAR_RATE  # a stated rate would have readers space the samples evenly
+        info = self._lsl.StreamInfo(name, "MoCap", len(columns), irregular, "double64", f"kinefit-{name}")
+        sampling = info.desc().append_child("sampling")
+        sampling.append_child_value("step_rate", f"{self.rate:g}")
+        sampling.append_child_value("time_stamps", "arrival of the newest frame of a step")
+        sampling.append_child_value("missing_samples", "person not found, or step dropped")
         channels = info.desc().append_child("channels")
         for label, unit in columns:
             channel = channels.append_child("channel")

@@ -14,12 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import read_npz, regular
+from kinefit._files import read_npy, read_npz, regular
 from kinefit._pictures import page_sizes, read_page, read_picture
 from kinefit.errors import FileError, ObservationError, names_file
 from kinefit.geometry.camera import Camera
 
 PICTURES = (".png", ".tif", ".tiff")
+_MAX_PERSON_DISTANCE = 8.0  # [m] of most of a depth image with a person in it
 _SATURATED_COUNT = 65535  # the highest of a 16-bit sensor: too far or too bright
 
 
@@ -43,6 +44,8 @@ class DepthSource:
     rate : float [Hz] or None
     names : tuple of str
         Of the files, if there is one for each frame; else empty.
+    notes : tuple of str
+        What is worth saying of the files.
     """
 
     count: int
@@ -54,11 +57,12 @@ class DepthSource:
     camera: Camera | None = None
     rate: float | None = None
     names: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def natural(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Key that sorts names by the numbers in them: 2.png before 10.png."""
-    parts = re.split(r"(\d+)", name)
+    """Key that sorts names by the numbers in them, whatever their case: 2.png before 10.png."""
+    parts = re.split(r"(\d+)", name.lower())
     return tuple((1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts)
 
 
@@ -67,7 +71,9 @@ def listed(path: Path) -> list[Path]:
     if path.is_dir():
         found = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
     elif "*" in path.name:
-        names = fnmatch.filter(os.listdir(path.parent), path.name) if path.parent.is_dir() else []
+        there = os.listdir(path.parent) if path.parent.is_dir() else []
+        literal = path.name.replace("[", "[[]")  # brackets in names of files, or else a choice of characters
+        names = fnmatch.filter(there, literal) or fnmatch.filter(there, path.name)
         found = [file for name in names if (file := path.parent / name).is_file()]
     else:
         found = [path] if regular(path).is_file() else []
@@ -118,10 +124,11 @@ def counts_of(picture: NDArray) -> NDArray:
     return depth
 
 
-def raw_source(files: list[Path], size: tuple[int, int] | None) -> DepthSource:
+def raw_source(files: list[Path], size: tuple[int, int] | None, unit: float | None = None) -> DepthSource:
     """Source of raw little-endian 16-bit counts, row by row: one file a frame, or all frames in one file.
 
-    Reads the largest group of files whose names differ by their numbers only.
+    Without a `unit` [m], values that are depths in float16 or float32 are read as such, in metres. Reads the largest
+    group of files whose names differ by their numbers only.
 
     Raises
     ------
@@ -135,25 +142,76 @@ def raw_source(files: list[Path], size: tuple[int, int] | None) -> DepthSource:
         remedy = "Give size = [width, height]; 614400 bytes are 640x480 in 16 bits."
         raise ObservationError(f"raw files of {length} bytes without a stated image size", file=files[0], remedy=remedy)
     width, height = size
-    frame = 2 * width * height
+    kind, said = _raw_type(files[0], width * height, unit)
+    frame = np.dtype(kind).itemsize * width * height
     for file in files:
         have = file.stat().st_size
         if have == 0 or have % frame or (len(files) > 1 and have != frame):
             raise ObservationError(
-                f"{have} bytes, but {width}x{height} px of 16 bits are {frame}", file=file,
+                f"{have} bytes, but {width}x{height} px of {8 * frame // (width * height)} bits are {frame}", file=file,
                 remedy="Correct the size, or name only the depth files by a pattern (depth-*).",
             )  # fmt: skip
     per_file = length // frame
 
     def image(i: int) -> NDArray:
         file, place = (files[i], 0) if len(files) > 1 else (files[0], i)
-        data = np.fromfile(file, "<u2", width * height, offset=place * frame)
+        data = np.fromfile(file, kind, width * height, offset=place * frame)
         if len(data) < width * height:
             raise FileError("became shorter while it was read", file=file, place=f"frame {i}", remedy="Copy it again.")
         return counts_of(data.reshape(height, width))
 
-    count = len(files) if len(files) > 1 else per_file
-    return DepthSource(count, image, size, 0.001, names=tuple(f.name for f in files) if len(files) > 1 else ())
+    names = tuple(file.name for file in files) if len(files) > 1 else ()
+    metres = 0.001 if kind == "<u2" else 1.0
+    return DepthSource(len(names) or per_file, image, size, metres, names=names, notes=(said,) if said else ())
+
+
+def _raw_type(file: Path, pixels: int, unit: float | None) -> tuple[str, str]:
+    """Type of the numbers in a raw file, by its length and values, and what is worth saying of it.
+
+    Depths as float16 or float32 [m] have bytes that are improbable as 16-bit counts of millimetres, and the reverse.
+    """
+    with file.open("rb") as stream:
+        data = stream.read(4 * pixels)
+    if file.stat().st_size == 4 * pixels and _is_metres(np.frombuffer(data, "<f4")):
+        return "<f4", "raw files of 4 bytes a pixel, read as float32 in metres; two 16-bit images look the same"
+    counts = np.frombuffer(data[: len(data) // 2 * 2], "<u2")
+    is_far = counts.any() and np.median(counts[counts > 0]) * 0.001 > _MAX_PERSON_DISTANCE
+    if unit is None and is_far and _is_metres(counts.view("<f2")):
+        return "<f2", "raw 16-bit files, read as float16 in metres; for counts that look the same write unit"
+    return "<u2", ""
+
+
+def _is_metres(values: NDArray) -> bool:
+    """Whether nearly all values that are not 0 or NaN are depths [m] of some metres."""
+    with np.errstate(invalid="ignore"):
+        known = values[np.isfinite(values) & (values != 0)].astype(float)
+        return bool(len(known)) and float(np.mean((known > 0.05) & (known < 30.0))) > 0.99
+
+
+def npy_source(files: list[Path]) -> DepthSource:
+    """Source of numpy files: one image (H, W) a file, or all (F, H, W) in one; whole numbers are counts, else metres.
+
+    Raises
+    ------
+    FileError
+        Damaged, or no array of numbers.
+    ObservationError
+        An array of another shape or type.
+    """
+    remedy = "Give an image (height, width) a file, or an archive .npz with `depth` (frames, height, width)."
+
+    def image(file: Path) -> NDArray:
+        array = read_npy(file, remedy=remedy)
+        if array.ndim not in ((2,) if len(files) > 1 else (2, 3)) or not array.size or array.dtype.kind not in "uif":
+            raise ObservationError(f"an array of shape {array.shape} of {array.dtype}", file=file, remedy=remedy)
+        return array
+
+    first = image(files[0])
+    unit = 1.0 if first.dtype.kind == "f" else 0.001
+    if first.ndim == 3:
+        return DepthSource(len(first), lambda i: counts_of(first[i]), first.shape[:0:-1], unit)
+    names = tuple(file.name for file in files)
+    return DepthSource(len(files), lambda i: counts_of(image(files[i])), first.shape[::-1], unit, names=names)
 
 
 @names_file

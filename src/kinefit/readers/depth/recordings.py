@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
@@ -12,16 +13,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
+from kinefit._files import read_text
 from kinefit.errors import FileError, ObservationError, names_file
+from kinefit.observations.clocks import counted_times, frames_by_name
 from kinefit.observations.videos import CloudVideo, DepthVideo
 from kinefit.readers.depth import clouds
-from kinefit.readers.depth.images import PICTURES, DepthSource, array_source, listed, picture_source, raw_source
+from kinefit.readers.depth.images import (
+    PICTURES,
+    DepthSource,
+    array_source,
+    listed,
+    npy_source,
+    picture_source,
+    raw_source,
+)
 from kinefit.readers.depth.streams import bag_source, track_source
 from kinefit.readers.ros.images import mcap_source
 from kinefit.readers.ros.recordings import inside
 
 FORMATS = (
-    "a folder of 16-bit PNG or TIFF, of raw 16-bit files or of organised PCD clouds; .npz; Azure Kinect .mkv; "
+    "a folder of 16-bit PNG or TIFF, of .npy, of raw 16-bit files or of organised PCD clouds; .npz; Azure Kinect .mkv; "
     "RealSense .bag; .mcap of ROS 2"
 )
 _MIN_MEDIAN_DEPTH = 0.1  # [m] no sensor measures nearer
@@ -29,6 +40,11 @@ _MAX_MEDIAN_DEPTH = 30.0  # [m] no sensor shows a person farther away
 _PERSON_DISTANCES = (0.4, 6.0)  # [m] typical range in front of a depth sensor
 _COUNT_UNITS = (1.0, 0.001, 0.01, 0.000125, 0.0001, 0.0002, 0.00025)  # [m] of sensors and data sets
 _DEFAULT_RATE = 30.0  # [Hz] of nearly every depth camera
+_TUM_LISTS = ("depth.txt", "associations.txt", "associate.txt", "assoc.txt")
+_MIN_SHARE_OF_EIGHT = 0.6  # of the different counts: by chance an eighth
+_MIN_DIFFERENT_COUNTS = 15  # of an image, so that their multiples are no chance
+_MAX_ROUGHNESS = 0.1  # of a depth: median difference of neighbouring pixels; of depth cameras below 0.02
+_MAX_MULTIPLE_ERROR = 0.1  # of the stated rate to that of the times in names: a whole number
 
 
 @checked
@@ -50,7 +66,8 @@ def read_depth(
     Parameters
     ----------
     path : file, folder or pattern (frames/depth_*.png)
-        16-bit PNG or TIFF (float TIFF: metres), raw little-endian 16-bit files, .npz (`depth` (F, H, W), optional
+        16-bit PNG or TIFF (float TIFF: metres), raw little-endian 16-bit files (or float16, float32 in metres), .npy of
+        one image a file, .npz (`depth` (F, H, W), optional
         `times` [s], `unit` [m], `rate` [Hz]), organised PCD, Azure Kinect .mkv, RealSense .bag, .mcap of ROS 2, with
         the topic as a part of the path if several have depth (session.mcap/front/depth/image_raw). Files are taken
         in the order of the numbers in their names.
@@ -66,7 +83,8 @@ def read_depth(
     range : (near, far) [m]
         Measurements outside of it are discarded.
     time_unit : float [s], optional
-        Unit of the last number in every file's name, if that is a time; default: frames are evenly spaced.
+        Unit of the last number in every file's name, if that is a time. Default: seconds since 1970, dates and decimal
+        seconds in the names are times; other numbers count frames at `rate`, also where they step by more than one.
     time_offset : float [s]
         Time of the first frame in the take.
 
@@ -79,15 +97,22 @@ def read_depth(
     """
     path = Path(path)
     name = sensor or path.stem
-    source = _source(path, name, size)
-    times, rate = _times(source, rate, usual_rate, time_unit, time_offset)
+    source = _source(path, name, size, unit)
+    times, rate, said = _times(source, rate, usual_rate, time_unit, time_offset, "depth images")
+    notes = [*source.notes, *said]
+    if unit is None and source.unit == 0.001 and not source.stated:
+        likely, why = _unit_of_counts(path, source)
+        source, notes = replace(source, unit=likely), [*notes, *([why] if why else [])]
     factor = _factor(unit if unit is not None else source.unit)
     video = DepthVideo(
         name, rate, times, source.size, _scaled(source.image, factor), float(range[0]), float(range[1]),
         source.camera, source=str(path),
     )  # fmt: skip
-    _check_content(video, factor)
-    return video
+    roughness = _check_content(video, factor)
+    if roughness > _MAX_ROUGHNESS:
+        differ = f"neighbouring pixels of {path.name} differ by {100 * roughness:.0f} %"
+        notes.append(f"{differ}: infrared images, photographs in 16 bits and depth that is mostly noise look so")
+    return replace(video, notes=tuple(notes))
 
 
 @checked
@@ -128,14 +153,14 @@ def read_clouds(
         raise _nothing(f"clouds ({', '.join(clouds.ENDINGS)})")
     name = sensor or path.stem
     source = DepthSource(len(files), lambda i: np.zeros((1, 1)), (1, 1), unit, names=tuple(f.name for f in files))
-    times, rate = _times(source, rate, usual_rate, time_unit, time_offset)
+    times, rate, said = _times(source, rate, usual_rate, time_unit, time_offset, "clouds")
     first = clouds.read_cloud(files[0])
     T = np.array(first.T_file_sensor if T_world_sensor is None else T_world_sensor, float)
     if T_world_sensor is None:
         T[:3, 3] *= unit
     video = CloudVideo(
         name, rate, times, lambda i: clouds.in_sensor(clouds.read_cloud(files[i])) * unit, T, viewpoint,
-        float(range[0]), float(range[1]), source=str(path),
+        float(range[0]), float(range[1]), source=str(path), notes=said,
     )  # fmt: skip
     points = clouds.in_sensor(first)
     away = np.linalg.norm(points[np.isfinite(points).all(axis=1)], axis=1) * unit
@@ -149,7 +174,7 @@ def is_unordered(path: Path) -> bool:
     return bool(files) and clouds.read_cloud(files[0]).shape is None
 
 
-def _source(path: Path, name: str, size: tuple[int, int] | None) -> DepthSource:
+def _source(path: Path, name: str, size: tuple[int, int] | None, unit: float | None) -> DepthSource:
     if (found := inside(path)) is not None:
         return mcap_source(found[0], name, found[1])
     files = listed(path)
@@ -172,7 +197,39 @@ def _source(path: Path, name: str, size: tuple[int, int] | None) -> DepthSource:
     if size is None and (colour := _of_ending(files, (".jpg", ".jpeg", ".bmp", ".gif"))):
         problem = f"{colour[0].suffix} files hold colour, not depth"
         raise FileError(problem, remedy=f"kinefit reads {FORMATS}.")
-    return raw_source(files, size)
+    if arrays := _of_ending(files, (".npy",)):
+        return npy_source(arrays)
+    return raw_source(files, size, unit)
+
+
+def _unit_of_counts(path: Path, source: DepthSource) -> tuple[float, str]:
+    """Unit [m] of 16-bit counts that no file states, and what is worth saying of it; millimetres without evidence.
+
+    Lists of a TUM RGB-D folder beside the images state their convention. First Kinects keep three bits of each count
+    for the number of a person: most counts are multiples of eight.
+    """
+    counts = [np.asarray(source.image(k)) for k in sorted({0, source.count // 2, source.count - 1})]
+    values = np.unique(np.concatenate([image[(image > 0) & np.isfinite(image)] for image in counts]))
+    if not len(values) or (values % 1 != 0).any():
+        return 0.001, ""
+    if any(_is_tum_list(folder / name) for folder in (path.parent, path) for name in _TUM_LISTS):
+        return 0.0002, "a list of a TUM RGB-D folder lies beside: unit = 0.0002 is taken; millimetres would be 0.001"
+    median = float(np.median(np.concatenate([image[image > 0] for image in counts])))
+    if 0.001 * median <= _PERSON_DISTANCES[1]:
+        return 0.001, ""
+    of_eight = float(np.mean(values % 8 == 0)) if len(values) > _MIN_DIFFERENT_COUNTS else 0.0
+    if of_eight > _MIN_SHARE_OF_EIGHT and _PERSON_DISTANCES[0] < 0.000125 * median < _PERSON_DISTANCES[1]:
+        said = f"{100 * of_eight:.0f} % of its counts are multiples of 8, as of first Kinects with a person's number in"
+        return 0.000125, f"{said} three bits: unit = 0.000125 is taken; depth in steps of 8 mm would be 0.001"
+    likely = [u for u in _COUNT_UNITS if u < 0.001 and _PERSON_DISTANCES[0] < median * u < _PERSON_DISTANCES[1]]
+    said = f"no file states the unit: as millimetres its median is {0.001 * median:.3g} m, farther than depth cameras"
+    return 0.001, f"{said} see. A hall looks so; else write unit = {' or '.join(f'{u:g}' for u in likely) or '...'}"
+
+
+def _is_tum_list(file: Path) -> bool:
+    """Whether a file lists depth images with their times, as TUM RGB-D folders do."""
+    rows = read_text(file, "it", remedy="", errors="replace")[:4000] if file.is_file() else ""
+    return re.search(r"\d+\.\d+[ \t]+\S*depth\S*\.png", rows) is not None
 
 
 def _of_ending(files: list[Path], endings: tuple[str, ...]) -> list[Path]:
@@ -209,33 +266,37 @@ def _depth(file: Path) -> NDArray:
 
 
 def _times(
-    source: DepthSource, rate: float | None, default_rate: float | None, time_unit: float | None, time_offset: float
-) -> tuple[NDArray, float]:
-    """Times (F,) [s] and rate [Hz]; the caller's values come before the file's."""
-    times = source.times
+    source: DepthSource, rate: float | None, default_rate: float | None, time_unit: float | None, time_offset: float,
+    what: str,
+) -> tuple[NDArray, float, tuple[str, ...]]:  # fmt: skip
+    """Times (F,) [s], rate [Hz], what is worth saying of them; the caller's values come before the file's."""
+    times, said = source.times, ""
     if time_unit is not None:
-        numbers = [re.findall(r"\d+", name) for name in source.names]
-        if not numbers or not all(numbers):
-            raise ObservationError("the file names have no number", remedy="Remove time_unit, give rate.")
-        counts = [int(found[-1]) for found in numbers]
-        times = np.array([count - counts[0] for count in counts], float) * time_unit
+        times = counted_times(source.names, time_unit)
     if not (np.isfinite(time_offset) and (time_unit is None or (np.isfinite(time_unit) and time_unit > 0))):
         raise ObservationError(f"time unit {time_unit} s, offset {time_offset} s", remedy="Give seconds.")
     if rate is not None and not 0 < rate < 1e6:
         raise ObservationError(f"rate {rate:g} Hz", remedy="Give frames per second.")
+    numbered = frames_by_name(source.names, what) if times is None and len(source.names) > 1 else None
+    if numbered is not None and (numbered.times is not None or rate or default_rate):
+        times, said = numbered.on_clock(rate or default_rate or _DEFAULT_RATE, what)
+        times = times if said else None
     if times is None:
         rate = rate or source.rate or (default_rate if source.count > 1 else _DEFAULT_RATE)
         if rate is None:
             raise ObservationError("its rate is not stated", remedy="Give rate = ... in frames per second.")
-        return np.arange(source.count) / rate + time_offset, rate
+        return np.arange(source.count) / rate + time_offset, rate, ()
     steps = np.diff(times)
     measured = 1.0 / float(np.median(steps[steps > 0])) if (steps > 0).any() else None
+    if said and measured and rate and abs(rate / measured - round(rate / measured)) < _MAX_MULTIPLE_ERROR:
+        rate = measured  # frames were left out, by their names
     if rate is not None and measured is not None and not 0.9 < rate / measured < 1.1:
         problem = f"the times of its frames give {measured:.4g} Hz, not {rate:g} Hz"
         raise ObservationError(problem, remedy="Remove the rate, or correct the unit of the times.")
     if source.rate and measured and abs(source.rate / measured - 1.0) < 0.1:
         measured = source.rate  # times are rounded to milliseconds
-    return times + time_offset, rate or measured or source.rate or default_rate or _DEFAULT_RATE
+    rate = rate or measured or source.rate or default_rate or _DEFAULT_RATE
+    return times + time_offset, rate, (said,) if said else ()
 
 
 def _factor(unit: float) -> float:
@@ -248,8 +309,12 @@ def _scaled(image: Callable[[int], NDArray], factor: float) -> Callable[[int], N
     return lambda i: image(i) * np.float32(factor)
 
 
-def _check_content(video: DepthVideo, factor: float) -> None:
-    """Check some frames for depth, a plausible unit and a range that contains it; raises ObservationError."""
+def _check_content(video: DepthVideo, factor: float) -> float:
+    """Check some frames for depth, a plausible unit and a range that contains it; raises ObservationError.
+
+    Returns the median difference of neighbouring pixels, as a share of the depth.
+    """
+    rough: list[NDArray] = []
     seen: list[NDArray] = []
     first = dict.fromkeys(round(k) for k in np.linspace(0, len(video) - 1, 5))
     for i in (*first, *(k for k in builtins.range(len(video)) if k not in first)):
@@ -257,11 +322,16 @@ def _check_content(video: DepthVideo, factor: float) -> None:
             break  # read the others only while all are empty
         image = np.asarray(video.image(i))
         if image.shape == video.size[::-1]:
+            pairs = image[:, :-1], image[:, 1:]
+            known = np.isfinite(image[:, :-1] + image[:, 1:]) & (np.minimum(*pairs) > 0)
+            rough.append(np.abs(pairs[1] - pairs[0])[known] / pairs[0][known])
             image = image[::4, ::4] if image.size > 40_000 else image
             seen.append(image[(image > 0) & np.isfinite(image)])
         else:
             video.frame(i)  # raises for the wrong size
     _check_values(np.concatenate(seen), factor, video.near, video.far)
+    differences = np.concatenate(rough)
+    return float(np.median(differences)) if len(differences) else 0.0
 
 
 def _check_values(depth: NDArray, factor: float, near: float, far: float, least: float = _MIN_MEDIAN_DEPTH) -> None:
@@ -271,7 +341,7 @@ def _check_values(depth: NDArray, factor: float, near: float, far: float, least:
     median = float(np.median(depth))
     if not least < median < _MAX_MEDIAN_DEPTH:
         likely = [unit for unit in _COUNT_UNITS if _PERSON_DISTANCES[0] < median / factor * unit < _PERSON_DISTANCES[1]]
-        entry = f"unit = {likely[0]:g}" if likely else "the sensor's own unit = ..."
+        entry = "unit = " + " or ".join(f"{unit:g}" for unit in likely) if likely else "the sensor's own unit = ..."
         what = " (probably millimetres)" if factor == 1.0 and median > 100 else ""
         problem = f"the median depth is {median:.4g} m{what}: the unit of {factor:g} m a count is wrong"
         raise ObservationError(problem, remedy=f"Write {entry} (metres a count).")

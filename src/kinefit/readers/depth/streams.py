@@ -11,7 +11,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import CalibrationError, FileError, ObservationError, extra, names_file
+from kinefit.errors import CalibrationError, FileError, KinefitError, ObservationError, extra, names_file
 from kinefit.geometry.camera import Camera
 from kinefit.readers.depth.images import DepthSource
 from kinefit.readers.video_files import open_container
@@ -109,10 +109,22 @@ def track_source(path: Path, name: str) -> DepthSource:
     )  # fmt: skip
 
 
+def has_depth_track(path: Path) -> bool:
+    """Whether a container has a video track that its recorder names as depth."""
+    try:
+        with open_container(path) as container:
+            return any(map(_is_named_depth, container.streams.video))
+    except KinefitError:
+        return False
+
+
+def _is_named_depth(stream: Any) -> bool:
+    return stream.metadata.get("title", "").upper() == "DEPTH" or "K4A_DEPTH_MODE" in stream.metadata
+
+
 def _depth_stream(container: Any) -> Any:
     videos = container.streams.video
-    named = [s for s in videos if s.metadata.get("title", "").upper() == "DEPTH" or "K4A_DEPTH_MODE" in s.metadata]
-    if named:
+    if named := list(filter(_is_named_depth, videos)):
         return named[0]
     if len(videos) == 1:
         return videos[0]

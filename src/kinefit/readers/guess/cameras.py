@@ -22,6 +22,7 @@ from kinefit.readers.guess.views import keypoint_entries, keypoint_sources, read
 from kinefit.readers.take.cameras import DEFAULT_FIELD_OF_VIEW
 from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.video import Video, common_frames
+from kinefit.readers.video_files import stated_time_code
 
 UNSTATED = 1.0  # [Hz] of files without a rate, until the user states it
 _MIN_SPREAD = 0.2  # [m] of the cameras from their centre: a desk
@@ -56,6 +57,8 @@ def describe_cameras(
         records = _on_steps(records, clocks, opened, rate)
         first = next((record for record in records if record), {})
         sizes = {name: video.size for name, video in opened.items()}
+        for name, entry in _time_codes(draft, opened).items():
+            draft.cameras.setdefault(name, {}).update(entry)
         images = _pictures(draft, rig, names, opened, chosen, guess_views.guess_turn(rig, first, sizes))
         shown: dict[str, ImageFrame] = {}
         entries = []
@@ -81,43 +84,48 @@ def describe_cameras(
         draft.note("keypoints", "sure", "none here: kinefit track runs the built-in detector on the videos")
 
 
-def describe_uncalibrated(draft: Draft, videos: Sequence[Path]) -> None:
-    """Enter the cameras of a folder with videos and no calibration.
-
-    Raises
-    ------
-    TakeError
-        Two videos of one name.
-    """
-    opened: dict[str, Video] = {}
+def describe_uncalibrated(draft: Draft, videos: Mapping[str, Path]) -> None:
+    """Enter the cameras of a folder with videos {camera: path} and no calibration."""
     with ExitStack() as stack:
-        for path in videos:
-            if path.stem in opened:
-                first = draft.name(opened[path.stem].path)
-                raise TakeError(
-                    f"two videos are called {path.stem}: {first} and {draft.name(path)}", file=draft.folder,
-                    remedy="Name the folder of one recording, with one video of each camera.",
-                )  # fmt: skip
-            opened[path.stem] = stack.enter_context(Video(path, rate=UNSTATED))
+        opened = {name: stack.enter_context(Video(path, rate=UNSTATED)) for name, path in videos.items()}
         draft.head["rate"] = draft.note_value("rate", _rate(draft, opened, []), "rate")
         counts = {name: f"{len(video)} frames" for name, video in opened.items()}
     more = "10 % wider places people 10 % nearer" if len(opened) == 1 else "kinefit track estimates it with the poses"
     why = f"degrees across the longer side; {DEFAULT_FIELD_OF_VIEW:g} is typical of telephones; {more}"
-    for path in videos:
-        video = Value(path, "likely", counts[path.stem]) if len(videos) > 1 else Value(path)
+    offsets = _time_codes(draft, opened)
+    for name, path in videos.items():
+        video = Value(path, "likely", counts[name]) if len(videos) > 1 else Value(path)
         wide = Value(DEFAULT_FIELD_OF_VIEW, "guess", why)
         if (stated := stated_focal_length(path)) is not None:
             whence = f"degrees across the longer side; the file states a lens of {stated:g} mm; {more}"
             wide = Value(round(field_of_view(stated), 1), "likely", whence)
-        draft.cameras[path.stem] = {"video": video, "field_of_view": wide}
+        draft.cameras[name] = {"video": video, "field_of_view": wide, **offsets.get(name, {})}
     if len(videos) == 1:
-        alone = f"{draft.name(videos[0])} alone: a network estimates depth; state height"
+        alone = f"{draft.name(*videos.values())} alone: a network estimates depth; state height"
         draft.note("camera", "likely", alone)
         return
     draft.head["up"] = Value("z", "sure", "found with the floor, from the people in view")
-    draft.note("cameras", "likely", f"{len(videos)} videos of one moment: {', '.join(map(draft.name, videos))}")
+    listed = ", ".join(map(draft.name, videos.values()))
+    draft.note("cameras", "likely", f"{len(videos)} videos of one moment: {listed}")
     found = "none here: kinefit track finds lenses, poses and clocks from the people in view"
     draft.note("calibration", "guess", found)
+
+
+def _time_codes(draft: Draft, opened: Mapping[str, Video]) -> dict[str, dict[str, Value]]:
+    """{camera: its `time_offset`} by the time codes of all videos; none where they are equal, or one lacks it."""
+    found = {name: stated_time_code(video.path, video.rate) for name, video in opened.items()}
+    codes = {name: code for name, code in found.items() if code is not None}
+    late = np.ptp([start for start, _ in codes.values()]) if codes else 0.0
+    if len(codes) < len(opened) or not late:
+        return {}
+    if late > (shortest := min(float(video.times[-1]) for video in opened.values())):
+        text = f"time codes {late:.6g} s apart, of videos of {shortest:.3g} s: not used, as clocks that nobody set"
+        draft.note("clocks", "open", text)
+        return {}
+    draft.note("clocks", "likely", "time_offset of each camera by its time code; clocks that nobody set look the same")
+    first = min(start for start, _ in codes.values())
+    why = "its time code "
+    return {name: {"time_offset": Value(start - first, "likely", why + code)} for name, (start, code) in codes.items()}
 
 
 def _nothing_fits(draft: Draft, calibration: CalibrationFile, *, found: bool) -> TakeError:

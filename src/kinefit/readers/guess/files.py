@@ -20,7 +20,9 @@ from kinefit._pictures import read_picture
 from kinefit.errors import CalibrationError, FileError, KinefitError, PluginError
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, SUFFIXES, read_calibration
-from kinefit.readers.guess.names import camera_of, natural
+from kinefit.readers.depth.images import PICTURES, natural, npy_source, picture_source
+from kinefit.readers.depth.streams import has_depth_track
+from kinefit.readers.guess.names import camera_of
 from kinefit.readers.keypoint_sets import SPLIT, other_keypoints
 from kinefit.readers.keypoints import decode_openpose, read_keypoints
 from kinefit.readers.plugins import CALIBRATIONS, KEYPOINTS, MARKERS
@@ -48,6 +50,9 @@ _CALIBRATION_NAME = re.compile(r"calib|intrin|extrin|cam", re.IGNORECASE)  # els
 _UNITS = ("mm", "cm", "inch", "dm")
 _LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
 _MASK_TOLERANCE = 10  # grey levels of a compressed mask's pixels from black or white
+_WITH_DEPTH = (".mkv", ".avi", ".mov")  # of videos that may have a track of depth
+_MIN_DEPTH_SIDE = 40  # [px]
+_MIN_DEPTH_VALUES = 15  # different ones in an image: a mask of 16 bits has few
 _MIN_GREY_SHARE = 0.1  # of the other pixels in a photograph
 
 
@@ -96,7 +101,8 @@ def list_files(folder: Path) -> list[Path]:
         depth = len(Path(parent).relative_to(folder).parts)
         searched = folders if depth < _MAX_DEPTH else []
         folders[:] = [name for name in searched if not name.startswith(".") and not name.endswith(_RESULT_ENDINGS)]
-        found += [path for name in names if not name.startswith(".") and (path := Path(parent) / name).is_file()]
+        shown = [name for name in names if not name.startswith(".") or name.endswith(".icloud")]
+        found += [path for name in shown if (path := Path(parent) / name).is_file()]
     return sorted(found, key=lambda path: natural(str(path)))
 
 
@@ -265,6 +271,46 @@ def _is_film(image: Path) -> bool:
 def _is_photograph(grey: NDArray) -> bool:
     """Whether a grey image is no mask, whose pixels are nearly black or white."""
     return float(np.mean((grey > _MASK_TOLERANCE) & (grey < 255 - _MASK_TOLERANCE))) > _MIN_GREY_SHARE
+
+
+def find_depth(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Depth among files: folders or patterns of images and videos with a depth track; images that are alone."""
+    found = [path for path in files if path.suffix.lower() in _WITH_DEPTH and has_depth_track(path)]
+    single = list[Path]()
+    for folder, group in _by_folder(list(files)):
+        series: dict[str, list[Path]] = {}
+        for path in (path for path in group if path.suffix.lower() in (*PICTURES, ".npy")):
+            series.setdefault(re.sub(r"\d+", "*", path.name), []).append(path)
+        for pattern, images in series.items():
+            count = _depth_images(images[0]) * len(images)
+            if count > 1:
+                found.append(folder if len(series) == 1 < len(images) else folder / re.sub(r"\*.*\*", "*", pattern))
+            elif count:
+                single += images
+    return found, single
+
+
+def _depth_images(file: Path) -> int:
+    """Number of depth images in a file: of one channel of 16 bits or float, and many values, as a mask has not."""
+    try:
+        source = npy_source([file]) if file.suffix.lower() == ".npy" else picture_source([file])
+        is_depth = min(source.size) >= _MIN_DEPTH_SIDE and len(np.unique(source.image(0))) > _MIN_DEPTH_VALUES
+        return source.count * is_depth
+    except KinefitError:
+        return 0
+
+
+_STAND_INS = {
+    (".zip", ".7z", ".rar", ".tar", ".tgz", ".tar.gz"): "an archive: unpack it, and run kinefit init again",
+    (".icloud",): "a placeholder of iCloud, the file itself is not here: download it (open it in Finder)",
+    (".crdownload", ".part", ".download"): "a download that is not finished: download it again",
+    (".360", ".insv"): "a 360° video of two fisheye images: export a flat view of it with the maker's program",
+}
+
+
+def stand_in(path: Path) -> str:
+    """What a file is that stands in place of a recording, and what to do; "" for others."""
+    return next((text for endings, text in _STAND_INS.items() if path.name.lower().endswith(endings)), "")
 
 
 def find_markers(files: list[Path], faults: list[KinefitError]) -> list[Path]:

@@ -9,13 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
+from kinefit._files import repeated
 from kinefit.errors import CalibrationError, KinefitError, PluginError, TakeError, command
 from kinefit.geometry.camera import Rig
+from kinefit.observations.videos import DepthVideo
+from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.guess import files as guess_files
 from kinefit.readers.guess.cameras import describe_cameras, describe_uncalibrated
 from kinefit.readers.guess.draft import Draft, Entry, Note, Value
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile
-from kinefit.readers.guess.names import trials
+from kinefit.readers.guess.names import COUNTED, later_chapters, trials
 from kinefit.readers.markers import read_markers
 from kinefit.readers.ros.images import Shown, mcap_rig, shown
 from kinefit.readers.take.entries import TABLES
@@ -67,7 +70,7 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
     draft = Draft(folder, Path(beside).absolute() if beside else folder)
     files = guess_files.list_files(folder)
     faults: list[KinefitError] = []
-    videos, markers = guess_files.find_videos(files, folder), guess_files.find_markers(files, faults)
+    videos, markers = _recorded_videos(draft, files), guess_files.find_markers(files, faults)
     keypoints, remarks = guess_files.find_keypoints(files, faults)
     recordings = guess_files.find_recordings(files)
     for remark in remarks:
@@ -75,14 +78,17 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
     for fault in faults:
         draft.note_error("files", fault)
     _describe_kinds(draft, files)
+    videos = _describe_depth(draft, files, videos, alone=not (keypoints or markers or recordings))
     if not (videos or keypoints or markers or recordings or any(draft.tables.values())):
+        said = "; ".join(note.text for note in draft.notes)
         raise TakeError(
-            f"no videos, keypoints, markers or recordings among {len(files)} files", file=folder,
-            remedy="Name a folder with videos (.mp4, .avi ...) or keypoints and a calibration, or with .c3d, .trc or "
-            ".mcap (ROS 2).",
+            f"no videos, keypoints, markers, depth or recordings among {len(files)} files{said and f': {said}'}",
+            file=folder,
+            remedy="Name a folder with videos (.mp4, .avi ...) or keypoints and a calibration, with depth images, "
+            ".c3d, .trc or .mcap (ROS 2).",
         )
     if videos or keypoints:
-        calibration = _choose_calibration(draft, files, videos + [k.path for k in keypoints], bool(markers))
+        calibration = _choose_calibration(draft, files, videos, [k.path for k in keypoints], bool(markers))
         if calibration is not None:
             describe_cameras(draft, calibration, videos, keypoints)
     if recordings:
@@ -90,6 +96,48 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
     _describe_markers(draft, markers)
     draft.comments.append(OPEN_HEIGHT)
     return Guess(draft.text(), tuple(draft.notes))
+
+
+def _recorded_videos(draft: Draft, files: list[Path]) -> list[Path]:
+    """The videos that begin a recording; later chapters of one, and what stands in place of a file, become notes."""
+    videos = guess_files.find_videos(files, draft.folder)
+    chapters = later_chapters(videos)
+    for path, first in chapters.items():
+        text = f"{draft.name(path)}: a later chapter of {draft.name(first)}, so one camera. Not used; join both: "
+        draft.note("video", "likely", f"{text}ffmpeg -f concat -i list.txt -c copy OUT.mp4 (in it: file 'NAME')")
+    for path in files:
+        if problem := guess_files.stand_in(path):
+            draft.note("files", "open", f"{draft.name(path)}: {problem}")
+    return [path for path in videos if path not in chapters]
+
+
+def _describe_depth(draft: Draft, files: Sequence[Path], videos: Sequence[Path], *, alone: bool) -> list[Path]:
+    """Enter depth of folders and of tracks in videos; returns the videos that are colour alone.
+
+    Beside no other sensor the world is that of the first depth camera; beside others depth is a comment.
+    """
+    found, single = guess_files.find_depth(files)
+    colour, seen = [path for path in videos if path not in found], list[DepthVideo]()
+    for path in single:
+        draft.note("depth", "open", f"{draft.name(path)}: one depth image, not a recording; name it in [[depth]]")
+    for path in found:
+        try:
+            seen.append(read_depth(path))
+        except KinefitError as error:
+            draft.note("depth", "open", f"{draft.name(path)}: not used as depth: {error.problem}. {error.remedy or ''}")
+            continue
+        video, is_used = seen[-1], alone and not colour and len(seen) == 1
+        why = f"{len(video)} depth images of {video.size[0]}x{video.size[1]} px"
+        entry = {"name": Value(path.stem), "file": Value(path, "likely", why)}
+        if video.camera is None:
+            entry["intrinsics"] = Value(None, "open", "[fx, fy, cx, cy] in pixels of the depth image")
+        draft.tables["depth"].append((is_used, entry))
+        aside = "" if is_used else "; a comment, its pose among the other sensors is not stated"
+        for text in (f"{draft.name(path)}: {why}{aside}", *video.notes):
+            draft.note(f"depth {path.stem}", "likely", text)
+        if is_used:
+            draft.head["up"] = draft.note_value("up", _up(None), "up")
+    return colour
 
 
 def _describe_kinds(draft: Draft, files: Sequence[Path]) -> None:
@@ -111,10 +159,9 @@ def _describe_kinds(draft: Draft, files: Sequence[Path]) -> None:
 
 
 def _choose_calibration(
-    draft: Draft, files: list[Path], seen: Sequence[Path], markers: bool
+    draft: Draft, files: list[Path], videos: list[Path], keypoints: list[Path], markers: bool
 ) -> CalibrationFile | None:
     """The calibration that most files fit; from the parent folder if there is none here; None without one."""
-    videos = guess_files.find_videos(files, draft.folder)
     found, singles, faults = guess_files.find_calibrations(files, videos, draft.folder)
     for error in [fault for fault in faults if isinstance(fault, PluginError)]:
         draft.note_error("calibration", error)
@@ -131,7 +178,7 @@ def _choose_calibration(
             remedy=f"{fault.remedy or ''} {_CALIBRATE}".strip(),
         )
     if not found:
-        if videos and len(seen) == len(videos):
+        if videos and not keypoints:
             if singles:
                 draft.note("calibration", "open", f"{draft.name(singles[0])} has one camera only: not used")
             describe_uncalibrated(draft, _of_one_moment(draft, videos))
@@ -140,7 +187,7 @@ def _choose_calibration(
         raise CalibrationError(f"no calibration of the cameras{alone}", file=draft.folder, remedy=_CALIBRATE)
 
     def fitting(c: CalibrationFile) -> int:
-        return max((len(t.files) for t in trials(seen, draft.folder, c.rig.names)[0]), default=0)
+        return max((len(t.files) for t in trials([*videos, *keypoints], draft.folder, c.rig.names)[0]), default=0)
 
     def rank(c: CalibrationFile) -> tuple[int, bool, int, str]:
         return -fitting(c), not c.is_refined, len(Path(draft.name(c.path)).parts), c.path.name
@@ -163,12 +210,30 @@ def _choose_calibration(
     return best
 
 
-def _of_one_moment(draft: Draft, videos: Sequence[Path]) -> list[Path]:
-    """The videos nearest to the folder, without static trials, calibrations and overlays of a detector."""
+def _of_one_moment(draft: Draft, videos: Sequence[Path]) -> dict[str, Path]:
+    """{camera: video} of those nearest to the folder, without static trials, calibrations and overlays of a detector.
+
+    Raises
+    ------
+    TakeError
+        Two videos of one name.
+    """
     moving = [v for v in videos if not any(p.search(draft.name(v)) for p in (STATIC, DRAWN_ON, OF_CALIBRATION))]
     moving = moving or list(videos)
     depth = min(draft.name(path).count("/") for path in moving)
-    return [path for path in moving if draft.name(path).count("/") == depth]
+    moving = [path for path in moving if draft.name(path).count("/") == depth]
+    folders = list(dict.fromkeys(path.parent for path in moving))
+    if len(folders) > 1 and all(COUNTED.fullmatch(path.stem) for path in moving):  # cameras count their own files
+        first = {folder.name: next(path for path in moving if path.parent == folder) for folder in folders}
+        for path in (path for path in moving if path not in first.values()):
+            draft.note("video", "guess", f"{draft.name(path)}: a later recording; kinefit init on its own folder")
+        return first
+    if twice := repeated(path.stem for path in moving):
+        both = [draft.name(path) for path in moving if path.stem == twice[0]]
+        problem = f"two videos are called {twice[0]}: {both[0]} and {both[1]}"
+        remedy = "Name the folder of one recording, with one video of each camera."
+        raise TakeError(problem, file=draft.folder, remedy=remedy)
+    return {path.stem: path for path in moving}
 
 
 def _above(folder: Path) -> list[Path]:

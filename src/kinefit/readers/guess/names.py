@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
+from kinefit.readers.depth.images import natural
+
 # Words before the number of a camera: "Camera 1", "port_0", "GoPro3", "c2". Longer words first.
 _CAMERA_WORD = r"(?:camera|cam|kamera|port|view|gopro|kinect|miqus|webcam|device|dev|c|v|k)"
 _NUMBERED = re.compile(rf"(?<![a-z]){_CAMERA_WORD}[\s_.#-]*(\d+)", re.IGNORECASE)
@@ -17,6 +19,8 @@ HOW = {
     "number": ("likely", "by the number in its name"),
     "shifted": ("guess", "by the number in its name, which counts from another start"),
     "size": ("likely", "by its image size"),
+    "nth": ("likely", "by its folder, whose files are recordings in their order"),
+    "uneven": ("guess", "by its folder; files are taken as recordings in their order, of different numbers"),
     "order": ("guess", "by order only: its name contains no camera"),
 }
 """{way of matching: (confidence level, its text in a message)}, in order of decreasing confidence."""
@@ -47,10 +51,21 @@ def common_words(place: str, other: str) -> int:
     return len(words[0] & words[1])
 
 
-def natural(text: str) -> list[tuple[int, int, str]]:
-    """Sorting key by which "cam2" stands before "cam10"."""
-    parts = re.findall(r"\d+|\D+", text.lower())
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
+COUNTED = re.compile(
+    r"(?:img|imgp|dsc[fn]?|mvi|vid|gopr|gp|g[hxl]|dji|pxl|mov|mah|clip|sam|c|p)?[_-]?\d{4}[\d_-]*", re.IGNORECASE
+)
+"""Stems of files that a camera counts by itself: they say nothing of which recording is whose."""
+
+_CHAPTER = re.compile(r"(?:G[HXLP](?P<chapter>\d\d)|GOPR)(?P<number>\d{4})", re.IGNORECASE)
+
+
+def later_chapters(videos: Sequence[Path]) -> dict[Path, Path]:
+    """{video: first chapter of its recording} of the videos that a GoPro began when a file was full."""
+    chapters: dict[tuple[Path, str], list[tuple[str, Path]]] = defaultdict(list)
+    for path in videos:
+        if found := _CHAPTER.fullmatch(path.stem):
+            chapters[path.parent, found["number"]].append((found["chapter"] or "", path))
+    return {path: min(group)[1] for group in chapters.values() for _, path in sorted(group)[1:]}
 
 
 def trials(
@@ -85,7 +100,10 @@ def trials(
     groups = _joined({place: files for place, files in groups.items() if files}, ways)
     out = [Trial(_ordered(files, names), ways[place], place) for place, files in groups.items()]
     if not any(len(trial.files) > 1 for trial in out):
-        whole, rest = _unnamed(list(paths), folder, names, sizes or {}, wanted or {})
+        in_folders = {p for t in out if "*" in t.place.rpartition("/")[0] for p in t.files.values()}
+        several = len({camera for t in out for camera, p in t.files.items() if p in in_folders}) > 1
+        unnamed = [path for path in paths if not (several and path in in_folders)]
+        whole, rest = _unnamed(unnamed, folder, names, sizes or {}, wanted or {})
         if whole:
             out, left = whole, rest
     return sorted(out, key=lambda t: (-len(t.files), natural(t.place))), left
@@ -144,6 +162,18 @@ def _joined(groups: dict[str, dict[str, Path]], ways: dict[str, str]) -> dict[st
     out: dict[str, dict[str, Path]] = {}
     for parent, places in above.items():
         cameras = [camera for place in places for camera in groups[place]]
+        counted: dict[str, list[Path]] = defaultdict(list)
+        for camera, path in (item for place in places for item in groups[place].items()):
+            counted[camera].append(path)
+        lengths = {len(files) for files in counted.values()}
+        if "*" in parent and len(counted) > 1 and max(lengths) > 1 and all(
+            COUNTED.fullmatch(path.stem) for files in counted.values() for path in files
+        ):  # folders are the cameras', and each camera counts its own files
+            for k in range(max(lengths)):
+                place = f"{parent}/*" if k == 0 else f"{parent}/* ({k + 1})"
+                out[place] = {camera: files[k] for camera, files in counted.items() if k < len(files)}
+                ways[place] = "nth" if len(lengths) == 1 else "uneven"
+            continue
         if len(places) == 1 or len(set(cameras)) < len(cameras):
             out |= {place: groups[place] for place in places}  # several recordings
             continue

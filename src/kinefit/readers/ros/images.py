@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -220,6 +220,8 @@ class McapVideo:
         No such topic, an unknown encoding, no unique image topic; a gap of more than half a second and three frames;
         times that give no rate.
     """
+
+    note: ClassVar[str] = ""
 
     def __init__(self, path: Path, topic: str | None) -> None:
         with reading(path) as reader:

@@ -33,6 +33,7 @@ class TakeCameras:
     clocks : {camera: (N,) [s] of its video's frames, from the first on}
     rates : {stream: [Hz]} of the streams that were loaded so far.
     streams : {stream: (N,) [s] in the take}, likewise.
+    sizes : {camera: (width, height) [px] of its video}
     """
 
     take: Take
@@ -41,6 +42,7 @@ class TakeCameras:
     clocks: Mapping[str, NDArray]
     rates: dict[str, float]
     streams: dict[str, NDArray]
+    sizes: Mapping[str, tuple[int, int]]
 
     def offset(self, name: str) -> float:
         """Time offset [s] of a camera."""
@@ -56,6 +58,12 @@ class TakeCameras:
         """(width, height) [px] of a camera's calibration."""
         assert self.rig is not None
         return self.rig[name].size
+
+    def image_size(self, name: str) -> tuple[int, int]:
+        """(width, height) [px] of a camera's delivered image."""
+        entry = next(entry for entry in self.take.cameras if entry.name == name)
+        size = self.size(name)
+        return self.sizes.get(name) or entry.size or (size[::-1] if entry.rotation % 180 else size)
 
     @property
     def fastest(self) -> float | None:

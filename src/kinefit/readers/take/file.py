@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import msgspec
 
 from kinefit._arguments import checked
-from kinefit._files import BACKSLASHES, LENGTHS, TIMES, parse_toml, read_text, worth
+from kinefit._files import BACKSLASHES, LENGTHS, TIMES, parse_toml, read_text, with_slashes, worth
 from kinefit.errors import (
     FileError,
     KinefitError,
@@ -26,7 +26,8 @@ from kinefit.errors import (
     printable,
     shortened,
 )
-from kinefit.readers.guess.files import VIDEOS
+from kinefit.readers.depth.images import listed
+from kinefit.readers.guess.files import VIDEOS, stand_in
 from kinefit.readers.plugins import KEYPOINTS, MARKERS, install
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.checks import check_take
@@ -66,7 +67,7 @@ def read_take(path: str | PathLike[str]) -> Take:
     head = raw.pop("take", {}) | {"path": path, "digest": digest}
     head["name"] = head.get("name") or printable(path.stem)
     if isinstance(body := head.get("body"), str) and body.endswith((".toml", ".npz")):
-        head["body"] = str(path.parent / body)
+        head["body"] = str(_there(path.parent, body))
     of_kinds = {table: entry_class(table) for table in KINDS.names() if table in raw}
     head["sensors"] = {t: _converted({t: raw.pop(t)}, tuple[of_kinds[t], ...], path, t) for t in of_kinds}  # type: ignore
     take: Take = _converted(head | {ATTRIBUTES.get(table, table): rows for table, rows in raw.items()}, Take, path)
@@ -97,9 +98,18 @@ def _path_in(folder: Path) -> Callable[[type, Any], Path]:
             raise ValueError(f"{shortened(value, 60)!r} is no path: it is too long")
         if any(ord(character) < 32 for character in value):
             raise ValueError(f"{value!r} is no path: {BACKSLASHES}")
-        return folder / value
+        return _there(folder, value)
 
     return make
+
+
+def _there(folder: Path, value: str) -> Path:
+    """The path in a folder, or the one that a path of Windows means where only that exists."""
+    path = folder / value
+    if "\\" in value and not path.exists():
+        other = folder / with_slashes(value)
+        return other if other.exists() or ("*" in other.name and listed(other)) else path
+    return path
 
 
 def _tidy(raw: dict[str, Any], path: Path, text: str) -> None:
@@ -173,7 +183,7 @@ def find_take(path: str | PathLike[str], *, wanted: Sequence[str] = ("track",)) 
         found = takes_in(path)
         if not found:
             raise FileError("no take file in this folder", file=path, remedy=f"Write one: {command('init', path)}")
-        if len(found) > 1 and found[0].name != "take.toml":
+        if len(found) > 1 and not is_default_take(found[0]):
             names = ", ".join(file.name for file in found[:10])
             raise TakeError(f"{len(found)} take files in this folder: {names}", file=path, remedy="Name one of them.")
         return found[0]
@@ -186,6 +196,9 @@ def find_take(path: str | PathLike[str], *, wanted: Sequence[str] = ("track",)) 
         raise FileError("a video, not a take file", file=path, remedy=remedy)
     if any(kind in MARKERS.get(name).suffixes for name in MARKERS.built_in):
         raise FileError("a marker file, not a take file", file=path, remedy=f"Run: {command('markers', 'fit', path)}")
+    if problem := stand_in(path):
+        what, _, remedy = problem.partition(": ")
+        raise FileError(f"{what}, not a take file", file=path, remedy=f"{remedy[:1].upper()}{remedy[1:]}.")
     if kind == ".npz":
         raise FileError("a motion, not a take file", file=path, remedy=f"Look at it: {command('view', path)}")
     return path
@@ -193,12 +206,18 @@ def find_take(path: str | PathLike[str], *, wanted: Sequence[str] = ("track",)) 
 
 def takes_in(folder: Path) -> list[Path]:
     """The take files that lie in a folder, take.toml first."""
-    return sorted((file for file in folder.glob("*.toml") if is_take(file)), key=lambda f: (f.name != "take.toml", f))
+    takes = (file for file in folder.glob("*") if file.suffix.lower() == ".toml" and file.is_file() and is_take(file))
+    return sorted(takes, key=lambda file: (not is_default_take(file), file))
+
+
+def is_default_take(file: Path) -> bool:
+    """Whether a file is called take.toml, in any case: some systems take Take.toml for the same name."""
+    return file.name.lower() == "take.toml"
 
 
 def is_take(file: Path) -> bool:
     """Whether a TOML file is a take file; one that cannot be read is, where it is called take.toml."""
-    if file.name == "take.toml":
+    if is_default_take(file):
         return True
     try:
         tables = parse_toml(read_text(file, "it", remedy=""), file)

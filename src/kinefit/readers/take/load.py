@@ -208,7 +208,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         remedy = f"They are found from the people in view: {command('track', take.path)}, or find_cameras in Python."
         raise TakeError("cameras that are not calibrated yet", file=take.path, remedy=remedy)
     images = {entry.name: image_frame(entry, rig, sizes.get(entry.name), take) for entry in take.cameras}
-    of_cameras = TakeCameras(take, rig, images, clocks, rates, streams)
+    of_cameras = TakeCameras(take, rig, images, clocks, rates, streams, sizes)
     keypoints, markers = [], tuple(_read_markers(entry) for entry in take.markers)
     for number, source in enumerate(take.keypoints):
         read, times = _read_keypoints(source, of_cameras, number)
@@ -260,6 +260,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         f"{place}: {Path(m.source).name} begins at {times[0]:.6g} s of the take, by its own clock and time_offset"
         for (place, times), m in zip(marked, markers) if m.first_time
     ]  # fmt: skip
+    notes += [f"{r.sensor}: {note}" for r in recordings for note in getattr(r, "notes", ())]
     notes += [*(n for m in markers for n in m.notes), *depth_notes((*depth, *clouds), rate)]
     cameras = [rig[entry.name] for entry in take.cameras if rig is not None]
     cameras += [video.camera for video in depth if video.camera is not None]

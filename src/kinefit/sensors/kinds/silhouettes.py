@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -13,11 +15,11 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from kinefit._pictures import read_picture
-from kinefit.errors import FileError, ObservationError, TakeError
+from kinefit.errors import FileError, ObservationError, TakeError, located
 from kinefit.geometry.camera import ImageFrame
 from kinefit.images.silhouette import BackgroundPlate, colour_mask
 from kinefit.observations import ColourVideo, Detections, SilhouetteVideo
-from kinefit.observations.clocks import frame_times
+from kinefit.observations.clocks import NamedFrames, frame_times, frames_by_name, is_even, nominal_rate
 from kinefit.readers.depth.images import listed
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.take.cameras import TakeCameras, stated_frame, stated_rate
@@ -27,6 +29,17 @@ from kinefit.readers.video import Video
 
 _SIDE = 1000  # [px] of an image that its background is taken from: larger ones are made smaller by a whole number
 _LEARNT = 30  # images of a video from which its background is learnt
+_SAMPLED_MASKS = 7  # of a recording, by which it is decided what is the body in them
+_WHITE = 127
+_MAX_BODY_SHARE = 0.5  # of an image that a body covers, with
+_MAX_BODY_BORDER = 0.9  # of the image's border
+_MIN_FLAT_SHARE = 0.02  # of the pixels that are not 0, in values that are labels: the values of soft edges have fewer
+_MAX_COLOUR_ERROR = 24  # of 255, of a compressed colour
+_MAX_STRAY_SHARE = 0.005  # of the pixels: soft edges and compression
+_MAX_GREY_SHARE = 0.25  # of the pixels, in masks with wide soft edges
+_MIN_COLOUR_SHARE = 0.002  # of the pixels, in a flat colour
+_COLOUR_BIN = 32
+_NAME_MASKS = "Name the folder or pattern of the masks: white is the body."
 _PICTURES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
 _Level = Annotated[int, Meta(ge=0, le=255, description="Give [r, g, b], 0 to 255 each.")]
 
@@ -68,41 +81,173 @@ class RegionEntry(TakeEntry, frozen=True, kw_only=True):
 
 def read_silhouettes(
     path: Path, *, camera: str, rate: float, size: tuple[int, int], image_frame: ImageFrame | None = None,
-    time_offset: float = 0.0, clock: NDArray | None = None,
+    image_size: tuple[int, int] | None = None, time_offset: float = 0.0, clock: NDArray | None = None,
 ) -> SilhouetteVideo:  # fmt: skip
     """Masks in a folder of images, or of a pattern such as "masks/*.png", one a frame; white is the body.
+
+    In images of other values or colours the body is all that differs from the background: labels, palettes, an alpha
+    channel that is not constant. Masks of another size and the same shape are scaled.
 
     Parameters
     ----------
     camera : str
-    rate : float [Hz]
+    rate : float [Hz] at which the numbers in the files' names count.
     size : (width, height) [px] of the calibration's image.
     image_frame : ImageFrame, optional
         From the calibration's image to the masks'; default: they are the same.
+    image_size : (width, height) [px] of the masks' image; default: `size`.
     time_offset : float [s] of the first mask.
-    clock : (N,) [s], optional, when the frames of the camera's video are shown: masks of as many frames take its times.
+    clock : (N,) [s], optional, when the frames of the camera's video are shown: masks of as many frames take its times,
+        fewer masks those of the frames that their numbers name.
 
     Raises
     ------
     FileError
         No images, or one that cannot be read.
     ObservationError
-        A mask of another size.
+        A mask of another shape; photographs, or labels of the whole image; an inverted mask; two files of one number.
     """
     files = [file for file in listed(path) if file.suffix.lower() in _PICTURES]
     if not files:
         raise FileError("no images of masks", file=path, remedy="Give a folder or pattern of PNG files, one a frame.")
-    wanted = _picture_size(files[0], size, image_frame)
+    with located(path):
+        numbered = frames_by_name([file.name for file in files], "masks")
+        times, said = _mask_times(numbered, rate, clock)
+        code = MaskCode.of(_sampled(files))
+    wanted = image_size or (size if image_frame is None else code.size)
+    _check_shape(code.size, wanted, files[0])
+    scaled = f"masks have {code.size[0]}x{code.size[1]} px: scaled to {wanted[0]}x{wanted[1]}" * (code.size != wanted)
+    notes = tuple(text for text in (said, code.note, scaled) if text)
 
     def image(i: int) -> NDArray:
-        mask = _mask(files[i])
-        if mask.shape[::-1] != wanted:
-            problem = f"the mask has {mask.shape[1]}x{mask.shape[0]} px, not {wanted[0]}x{wanted[1]}"
-            raise ObservationError(problem, file=files[i], remedy="Give masks of the size of the camera's image.")
+        mask = code.mask(read_picture(files[i], cv2.IMREAD_UNCHANGED))
+        _check_shape(mask.shape[::-1], wanted, files[i])
+        mask = mask if mask.shape[::-1] == wanted else cv2.resize(mask, wanted, interpolation=cv2.INTER_LINEAR)
         return in_calibration(mask, size, image_frame)
 
-    times = time_offset + frame_times(len(files), rate, clock)
-    return SilhouetteVideo(camera, rate, times, size, image, str(path))
+    own_rate = rate if is_even(times, rate) or len(times) < 2 else nominal_rate(times)
+    return SilhouetteVideo(camera, own_rate, time_offset + times, size, image, str(path), notes)
+
+
+def _sampled(files: Sequence[Path]) -> list[NDArray]:
+    """The masks, as stored, by which it is decided how all are to be read; the first has to be readable."""
+    out = [read_picture(files[0], cv2.IMREAD_UNCHANGED)]
+    for i in sorted({round(k) for k in np.linspace(0, len(files) - 1, _SAMPLED_MASKS)} - {0}):
+        with suppress(FileError):  # raised where the mask is asked for
+            out.append(read_picture(files[i], cv2.IMREAD_UNCHANGED))
+    return out
+
+
+def _mask_times(numbered: NamedFrames, rate: float, clock: NDArray | None) -> tuple[NDArray, str]:
+    """Times (N,) [s] of masks from the video's first frame on, and what is worth saying of them."""
+    times, said = numbered.on_clock(rate, "masks")
+    if clock is None or numbered.times is not None or numbered.numbers[-1] > len(clock):
+        return times, said
+    if len(clock) == len(times):
+        return clock, ""
+    first = 1 if numbered.numbers[0] == 1 or numbered.numbers[-1] == len(clock) else 0
+    return clock[numbered.numbers - first], f"{len(times)} masks of the video's {len(clock)} frames, by their numbers"
+
+
+def _check_shape(size: tuple[int, int], wanted: tuple[int, int], file: Path) -> None:
+    """Raise ObservationError where the size (width, height) [px] of a mask has not the shape that is wanted."""
+    if abs(size[0] * wanted[1] - size[1] * wanted[0]) > max(*size, *wanted):  # a pixel by rounding
+        problem = f"the mask has {size[0]}x{size[1]} px, not {wanted[0]}x{wanted[1]}"
+        raise ObservationError(problem, file=file, remedy="Give masks of the size of the camera's image.")
+
+
+@dataclass(frozen=True, eq=False)
+class MaskCode:
+    """Which values of a recording's mask images are the body, as some of its images tell.
+
+    Parameters
+    ----------
+    size : (width, height) [px] of the images
+    by_alpha : whether the alpha channel is the mask
+    background : colour or value of the background, of images in which all else is the body; None: white is the body
+    tolerance : difference of a channel from the background, above which it is the body
+    note : what is worth saying
+    """
+
+    size: tuple[int, int]
+    by_alpha: bool = False
+    background: NDArray | None = None
+    tolerance: int = 0
+    note: str = ""
+
+    @classmethod
+    def of(cls, images: Sequence[NDArray]) -> MaskCode:
+        """The code of some images of a recording, each (H, W) or (H, W, channels) as stored.
+
+        Raises
+        ------
+        ObservationError
+            Photographs; labels of the whole image; masks in which the body is black.
+        """
+        by_alpha = any(image.ndim == 3 and image.shape[2] == 4 and np.ptp(image[..., 3]) > 0 for image in images)
+        code = cls(images[0].shape[1::-1], by_alpha)
+        values = [code._values(image) for image in images]
+        pixels = np.concatenate([image.reshape(len(image) * image.shape[1], -1).max(axis=1) for image in values])
+        if any(np.mean(np.ptp(image.astype(int), axis=2) > _MAX_COLOUR_ERROR) > _MAX_STRAY_SHARE for image in values):
+            code = replace(code, **_colour_code(values))
+        elif pixels.dtype != np.uint8 or pixels.max(initial=0) <= 1:
+            code = replace(code, background=np.zeros(1, int))
+        else:
+            code = replace(code, **_grey_code(pixels))
+        masks = [mask for mask in (code.mask(image) > _WHITE for image in images) if mask.any()]
+        share = float(np.median([mask.mean() for mask in masks] or [0.0]))
+        if share > _MAX_BODY_SHARE and np.median([_border(mask).mean() for mask in masks]) > _MAX_BODY_BORDER:
+            what = "white" if code.background is None else "all but the background's value"
+            problem = f"{what} covers {100 * share:.0f} % of the masks and their border: inverted, or labels of all"
+            remedy = "Make the body white and all else black. A body that fills the image looks the same."
+            raise ObservationError(problem, remedy=remedy)
+        return code
+
+    def mask(self, image: NDArray) -> NDArray:
+        """(H, W) uint8, 255 for the body, of an image as stored."""
+        values = self._values(image)
+        if self.background is None:
+            return values.max(axis=2)
+        apart = np.abs(values.astype(float) - self.background).max(axis=2) > self.tolerance
+        return np.where(apart, 255, 0).astype(np.uint8)
+
+    def _values(self, image: NDArray) -> NDArray:
+        """(H, W, 1 or 3) of an image: grey, colours, or its alpha channel where that is the mask."""
+        if image.ndim == 2:
+            return image[..., None]
+        return image[..., 3:] if self.by_alpha and image.shape[2] == 4 else image[..., :3]
+
+
+def _border(image: NDArray) -> NDArray:
+    """The pixels of an image's four edges, (N) or (N, channels)."""
+    return np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+
+
+def _grey_code(values: NDArray) -> dict[str, Any]:
+    """How grey values (N,) uint8 of masks are to be read, as fields of `MaskCode`; refuses photographs."""
+    found, counts = np.unique(values[values > 0], return_counts=True)
+    flat = found[counts > _MIN_FLAT_SHARE * counts.sum()]
+    on_flat = float(np.isin(values, [0, *flat]).mean())
+    if flat.size and flat[0] < 255 - _MAX_COLOUR_ERROR and on_flat > 1.0 - _MAX_STRAY_SHARE:
+        listed = ", ".join(str(value) for value in flat[:8])
+        note = f"images of the values 0 and {listed}: all but 0 is taken as the body"
+        return {"background": np.zeros(1, int), "note": note}
+    levels = float(np.mean((values > _MAX_COLOUR_ERROR) & (values < 255 - _MAX_COLOUR_ERROR)))
+    if levels > _MAX_GREY_SHARE:
+        raise ObservationError(f"images of many grey values, in {100 * levels:.0f} % of the pixels", remedy=_NAME_MASKS)
+    return {}
+
+
+def _colour_code(images: Sequence[NDArray]) -> dict[str, Any]:
+    """How images (H, W, 3) of flat colours are to be read, as fields of `MaskCode`; refuses photographs."""
+    pixels = np.concatenate([image.reshape(-1, 3) for image in images])
+    counts = np.unique(pixels // _COLOUR_BIN, axis=0, return_counts=True)[1]
+    if counts[counts > _MIN_COLOUR_SHARE * len(pixels)].sum() < (1.0 - _MAX_GREY_SHARE) * len(pixels):
+        raise ObservationError("images of many colours: photographs, or drawn over them", remedy=_NAME_MASKS)
+    colours, counts = np.unique(np.concatenate([_border(image) for image in images]), axis=0, return_counts=True)
+    background = colours[np.argmax(counts)].astype(int)
+    note = f"coloured images: all but the colour of their border, {background[::-1].tolist()}, is taken as the body"
+    return {"background": background, "tolerance": _MAX_COLOUR_ERROR, "note": note}
 
 
 def _silhouettes(entry: SilhouetteEntry, cameras: TakeCameras) -> SilhouetteVideo:
@@ -113,8 +258,8 @@ def _silhouettes(entry: SilhouetteEntry, cameras: TakeCameras) -> SilhouetteVide
         assert entry.file is not None
         return read_silhouettes(
             entry.file, camera=name, rate=stated_rate(entry.rate or cameras.rates.get(f"video {name}") or take.rate),
-            size=size, image_frame=stated_frame(frame, entry.frame, "masks"), time_offset=offset,
-            clock=None if entry.rate else clock,
+            size=size, image_frame=(stated := stated_frame(frame, entry.frame, "masks")), time_offset=offset,
+            image_size=None if stated is None else cameras.image_size(name), clock=None if entry.rate else clock,
         )  # fmt: skip
     if entry.format == "detect":
         file = entry.file or detections_file(take.path, name)
@@ -194,20 +339,6 @@ def _everybody(found: Detections, i: int) -> NDArray:
         if mask is not None:
             out |= mask
     return 255 * out.astype(np.uint8)
-
-
-def _picture_size(file: Path, size: tuple[int, int], frame: ImageFrame | None) -> tuple[int, int]:
-    """Size of the masks: of the calibration's image, or of another one that a frame leads to."""
-    return size if frame is None else _mask(file).shape[::-1]
-
-
-def _mask(file: Path) -> NDArray:
-    mask = read_picture(file, cv2.IMREAD_UNCHANGED)
-    if mask.ndim == 3:
-        mask = mask[..., 3] if mask.shape[2] == 4 else mask[..., :3].max(axis=2)
-    if mask.dtype != np.uint8:
-        mask = np.where(mask > 0, 255, 0).astype(np.uint8)
-    return 255 * mask if mask.max(initial=0) == 1 else mask
 
 
 def in_calibration(mask: NDArray, size: tuple[int, int], frame: ImageFrame | None) -> NDArray:
