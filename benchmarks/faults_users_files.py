@@ -42,12 +42,12 @@ def run() -> None:
     """Print how many cases and siblings are right, said and unsaid, and the names of those unsaid."""
     root = data("cases_of_users")
     for name, answers in (("cases", CASES), ("siblings", SIBLINGS)):
-        if name == "cases" and root is None:
-            continue
-        chosen = dict(list(answers.items())[: amount(None, 6)])
-        counts: Counter[str] = Counter(_answers(chosen, root if name == "cases" else None))
-        for state, goal in (("right", ">= 0"), ("said", ">= 0"), ("unsaid", "== 0")):
-            figure(f"faults_users_files_{name}_{state}", counts[state], f"of {len(chosen)}", goal)
+        absent = name == "cases" and root is None
+        chosen = {} if absent else dict(list(answers.items())[: amount(None, 6)])
+        counts = Counter(_answers(chosen, root if name == "cases" else None))
+        for state, goal in (("right", f">= {len(answers)}"), ("said", "== 0"), ("unsaid", "== 0")):
+            value, whole = None if absent else counts[state], chosen == answers
+            figure(f"faults_users_files_{name}_{state}", value, f"of {len(answers)}", goal, "no recordings", whole=whole)
 
 
 def _answers(answers: Mapping[str, Answer], root: Path | None) -> list[str]:
