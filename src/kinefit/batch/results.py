@@ -10,7 +10,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kinefit._files import writing
 from kinefit.errors import ExportError, located
 from kinefit.readers.plugins import PLUGIN_COMMENT, Extension, Extensions
 
@@ -151,6 +150,8 @@ def write_format(motion: Motion, name: str, path: Path, **options: Any) -> None:
     PluginError
         A plug-in raises an error, or writes nothing.
     """
+    from kinefit._files import writing
+
     format = FORMATS.get(name)
     if format.plugin is None:
         format.write(motion, path, **options)

@@ -20,7 +20,6 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from kinefit._arguments import checked
 from kinefit.errors import KinefitError, ObservationError, PluginError, check_choice
 
 if TYPE_CHECKING:
@@ -241,6 +240,8 @@ def _record(of: Extensions[Any], name: str) -> Any:
     record = plugin.load()
     if not isinstance(record, of.record):
         raise plugin.error(f"is no {of.record.__name__}")
+    from kinefit._arguments import checked  # and NumPy, which help does without
+
     try:
         record = checked(type(record))(**vars(record) | {"plugin": plugin})
     except ObservationError as error:
