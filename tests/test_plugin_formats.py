@@ -279,26 +279,27 @@ def test_a_reader_of_calibrations_that_fails(here, tmp_path, pair, words):
 
 def test_a_format_of_keypoints_that_is_not_installed(recording):
     words = "no keypoint format 'dlc'; there are: openpose, mediapipe, caliscope"
-    with pytest.raises(TakeError, match=f"{words}.*-m pip install its package"):
+    with pytest.raises(TakeError, match=f"{words}.*install the plug-in that adds this keypoint format\\."):
         read_take(recording)
     noted = 'format = "dlc"   # sure: of the plug-in kinefit-formats 0.1: tables of DeepLabCut'
     recording.write_text(recording.read_text().replace('format = "dlc"', noted))
     with pytest.raises(TakeError, match=r"-m pip install kinefit-formats\.") as caught:
         read_take(recording)
     assert caught.value.file == recording and caught.value.place == "[[keypoints]] 1"
-    with pytest.raises(ObservationError, match="no keypoint format 'dlc'.*pip install"):
+    with pytest.raises(ObservationError, match="no keypoint format 'dlc'.*install the plug-in"):
         read_keypoints(recording.parent / "cam01.csv", format="dlc", camera="cam01", rate=30.0)
 
 
 def test_a_format_of_motions_that_is_not_installed(tmp_path, recording):
-    with pytest.raises(ExportError, match="no format 'angles'; there are: motion, csv.*-m pip install its package"):
+    words = r"no format 'angles'; there are: motion, csv.*install the plug-in that adds this format\."
+    with pytest.raises(ExportError, match=words):
         asked_take(recording, Choices(formats=("motion", "angles")))
     (row,) = work(TakeJob(recording, "a", tmp_path / "out", "out", Choices(formats=("angles",))))
     assert row.status == "failed" and "no format 'angles'" in row.error
     write_motion(motion(), tmp_path / "motion.npz")
     for words in (("export", tmp_path / "motion.npz", "--to", "angles"), ("track", recording, "--formats", "angles")):
         told = CliRunner().invoke(main, [*map(str, words)])
-        assert told.exit_code == 2 and "no format 'angles'" in told.output and "pip install" in told.output
+        assert told.exit_code == 2 and "no format 'angles'" in told.output and "install the plug-in" in told.output
 
 
 def test_keys_that_mean_nothing_to_a_plugin(here, recording):

@@ -344,7 +344,7 @@ def test_an_insole_alone_gives_no_first_pose(here, tmp_path, recording):
 
 def test_a_kind_that_is_not_installed(recording):
     text = recording.read_text()
-    words = r"there are: .*tracker.*install the plug-in that adds this table: .* -m pip install its package"
+    words = r"there are: .*tracker.*install the plug-in that adds this table\."
     with pytest.raises(TakeError, match=f"no sensor or table 'insole'; {words}"):
         read_take(recording)
     recording.write_text(text.replace("[[insole]]", "[[insole]]    # of the plug-in kinefit-insole 0.1: pressure"))

@@ -215,8 +215,8 @@ def install(what: str, name: str = "", text: str = "") -> str:
     name, text : pattern of the name in a take file, and its text, in which `kinefit init` wrote the distribution
     """
     noted = re.search(rf"^{name}\s*#.*{PLUGIN_COMMENT}(\S+)", text, re.MULTILINE)
-    pip = f"{sys.executable} -m pip install {noted[1] if noted else 'its package'}"
-    return f"Correct the name, or install the plug-in that adds this {what}: {pip}."
+    pip = f": {sys.executable} -m pip install {noted[1]}" if noted else ""
+    return f"Correct the name, or install the plug-in that adds this {what}{pip}."
 
 
 @cache
