@@ -384,11 +384,11 @@ def systematic_errors(
     joints = np.sum(product(moved, dofs) * moved, axis=-1) + np.sum(product(whole, Sigma) * whole, axis=-1)
     by_shape = product(response, priors.root)
     shape = product(by_shape, by_shape.T)
-    surplus = pushed_by(np.sqrt(np.maximum(assumed - np.square(noise.white), 0.0)))
-    surplus = gram(surplus, surplus) + others.surplus
-    white = _white_shares(
-        body, state, averaged * (gram(J, pushed) + other_information), averaged * surplus, moved
-    )  # fmt: skip
+    white = np.ones(len(dofs)), np.ones(joints.shape)
+    if averaged:
+        surplus = pushed_by(np.sqrt(np.maximum(assumed - np.square(noise.white), 0.0)))
+        surplus, information = gram(surplus, surplus) + others.surplus, gram(J, pushed) + other_information
+        white = _white_shares(body, state, averaged * information, averaged * surplus, moved)
     return SystematicErrors(
         dofs + shape, np.maximum(joints, 0.0), alone, np.concatenate([constant, by_shape], axis=1), drift, *white
     )
