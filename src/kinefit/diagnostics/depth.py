@@ -26,7 +26,7 @@ _MIN_PLANE_GAIN = 1.3  # of the plane's points, if distances are along the rays
 
 UNCHECKED = (
     "Depth alone: not checked are the poses of its cameras, whether the image is mirrored, whether the intrinsics are "
-    "those of another stream, and the unit where nobody moves."
+    "those of another stream, and the unit where no person moves."
 )
 """What `kinefit check` cannot say of depth without videos."""
 

@@ -282,8 +282,8 @@ class FileFormats(Extensions[FileFormat]):
         """All names, kinefit's own first; warns of plug-ins of no kind of file."""
         for point, plugins in installed(self.group).items():
             if not point.startswith(_KINDS_OF_FILES):
-                told = f"{plugins[0]} is ignored: its name begins with none of {', '.join(_KINDS_OF_FILES)}"
-                warnings.warn(told, stacklevel=2)
+                problem = f"{plugins[0]} is ignored: its name begins with none of {', '.join(_KINDS_OF_FILES)}"
+                warnings.warn(problem, stacklevel=2)
         return super().names()
 
     def name_of(self, path: Path, faults: list[KinefitError] | None = None) -> str | None:

@@ -112,10 +112,10 @@ def parameter_errors(found: SubjectFit, root: NDArray, used: NDArray) -> Paramet
     """Some parameters (q,) int of a fit, with their errors `root` (q, m), of which root rootᵀ is the covariance."""
     names, cameras = list(found.names), found.cameras
     if cameras is not None:
-        told = cameras.rig if cameras.calibrated is None else cameras.calibrated
+        calibration = cameras.rig if cameras.calibrated is None else cameras.calibrated
         first = len(names) - len(cameras.names)
         for k, name in enumerate(names[first:]):
-            pose = told[cameras.free[k // 6]].T_camera_world
+            pose = calibration[cameras.free[k // 6]].T_camera_world
             names[first + k] = f"{name} {hashlib.sha256(pose.tobytes()).hexdigest()[:8]}"
     information = found.prior.information[np.ix_(used, used)]
     return ParameterErrors(tuple(names[k] for k in used), found.mean[used], root @ root.T, information, root.T)

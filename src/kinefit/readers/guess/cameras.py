@@ -119,10 +119,10 @@ def _time_codes(draft: Draft, opened: Mapping[str, Video]) -> dict[str, dict[str
     if len(codes) < len(opened) or not late:
         return {}
     if late > (shortest := min(float(video.times[-1]) for video in opened.values())):
-        text = f"time codes {late:.6g} s apart, of videos of {shortest:.3g} s: not used, as clocks that nobody set"
+        text = f"time codes {late:.6g} s apart, of videos of {shortest:.3g} s: not used, as clocks never set"
         draft.note("clocks", "open", text)
         return {}
-    draft.note("clocks", "likely", "time_offset of each camera by its time code; clocks that nobody set look the same")
+    draft.note("clocks", "likely", "time_offset of each camera by its time code; clocks never set look the same")
     first = min(start for start, _ in codes.values())
     why = "its time code "
     return {name: {"time_offset": Value(start - first, "likely", why + code)} for name, (start, code) in codes.items()}
