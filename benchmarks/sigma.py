@@ -55,7 +55,7 @@ def errors(truth: Motion, motion: Motion) -> list[tuple[str, float, float, float
         for side, one in found.get(stem, {}).items():
             if one is not None:
                 low, high = one.ends
-                off = away[high, one.coordinate - 6] - away[low, one.coordinate - 6]
+                off = np.subtract(*away[[high, low], one.terms[1] - 6])
                 out.append((joint, off, one.span[1] / 2, alone[stem][side].span[1] / 2))
     return out
 

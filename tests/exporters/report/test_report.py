@@ -23,11 +23,11 @@ from kinefit.exporters.report.moments import (
 )
 from kinefit.exporters.report.page import band, thinned
 from kinefit.exporters.report.report import trust_sentence, write_report
-from kinefit.exporters.tables import _root_turns, curves
+from kinefit.exporters.tables import curves
 from kinefit.findings import listed, runs_of
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Residuals
+from kinefit.motion import Residuals, rotation_between_up
 from kinefit.simulation import cut, known_motion
 
 F = 80
@@ -218,25 +218,27 @@ def test_a_constant_shift_points_to_the_calibration(tmp_path):
 # Angles
 
 
-def test_the_root_turns_have_the_deviations_of_a_turn_about_the_worlds_axes():
-    motion = smooth_motion(6)
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_slopes_of_all_coordinates_are_their_derivatives_by_the_motions_own(up):
+    motion = smooth_motion(6, up=up)
     std = np.array([0.01, 0.02, 0.03])
     motion = replace(motion, dof_std=np.concatenate([np.zeros((6, 3)), np.tile(std, (6, 1)), motion.dof_std[:, 6:]], 1))
-    angles, found = _root_turns(motion)
-    columns = []
-    for axis in np.eye(3):
+    for k, unit in enumerate(np.eye(6)):
         both = []
         for step in (1e-6, -1e-6):
             T = motion.Ts_world_root.copy()
-            T[:, :3, :3] = se3.exp_so3(step * axis) @ T[:, :3, :3]
-            both.append(_root_turns(replace(motion, Ts_world_root=T))[0])
-        columns.append((both[0] - both[1]) / 2e-6)
-    expected = np.sqrt(np.sum((np.stack(columns, -1) * std) ** 2, axis=-1))
-    assert np.allclose(found, expected, rtol=1e-5)
-    assert angles.shape == (6, 3)
+            T[:, :3, :3] = se3.exp_so3(step * unit[3:]) @ T[:, :3, :3]
+            T[:, :3, 3] += step * unit[:3]
+            both.append(curves(replace(motion, Ts_world_root=T)))
+        for one, plus, minus in zip(curves(motion), *both):
+            slope = one.slopes[:, one.coordinates.index(k)] if k in one.coordinates else 0.0
+            assert np.allclose((plus.values - minus.values) / 2e-6, slope, atol=1e-4), one.name
+    tilt = next(c for c in curves(motion.turned("y")) if c.name == "pelvis_tilt")
+    R = rotation_between_up(up, "y")
+    assert np.allclose(tilt.std, np.sqrt(tilt.slopes**2 @ (np.abs(R) @ std) ** 2), rtol=1e-5)
     blind = np.array(motion.dof_std)
     blind[2, 4] = np.inf
-    assert np.isinf(_root_turns(replace(motion, dof_std=blind))[1][2]).all()
+    assert np.isinf(next(c for c in curves(replace(motion, dof_std=blind)) if c.name == "pelvis_tilt").std[2])
 
 
 def test_all_coordinates_are_there_in_degrees():
