@@ -18,6 +18,7 @@ from kinefit.exporters.report.methods import lengths_table, methods_sentences
 from kinefit.exporters.report.moments import (
     doubtful_moments,
     never_observed,
+    probably_far,
     shared_by_prior,
     throughout_sentence,
 )
@@ -213,6 +214,20 @@ def test_a_constant_shift_points_to_the_calibration(tmp_path):
     text = page_of(good_motion(offsets=((0, 0), (-14, 3), (0, 0))), tmp_path)
     assert re.search(r"Constant shift in cam1 \(-1\d\.\d, \+\d\.\d\) px", text) and "kinefit check" in text
     assert "Constant shift" not in page_of(good_motion(), tmp_path)
+
+
+def test_the_probability_of_five_centimetres_is_that_of_the_error_bars():
+    motion = smooth_motion(5)
+    motion = replace(motion, dof_std=np.full_like(motion.dof_std, 1e-6))
+    for std in ([0.03, 0.03, 0.03], [0.04, 1e-6, 1e-6], [0.02, 0.05, 0.03]):
+        found = probably_far(replace(motion, joint_std=np.broadcast_to(std, motion.joint_std.shape)))
+        draws = np.linalg.norm(np.random.default_rng(0).normal(0.0, std, (200_000, 3)), axis=1)
+        assert found == pytest.approx(np.mean(draws > 0.05), abs=0.02)
+    knee = np.full(motion.joint_std.shape, 0.01)
+    knee[:, motion.body.tree.segment("shank_l")] = 0.1  # an end of the thigh, too
+    far = probably_far(replace(motion, joint_std=knee)) > 0.5
+    names = [name for name, own in zip(motion.body.tree.segments, far.all(axis=0)) if own]
+    assert names == ["thigh_l", "shank_l"] and not far[:, motion.body.tree.segment("foot_l")].any()
 
 
 # Angles

@@ -28,7 +28,7 @@ def flagged(motion: Motion, moments: Sequence[Moment], pictures: Pictures, width
     if not motion.residuals and not moments:
         return [p.callout("note", "This motion has no measurements, so doubtful moments are not known.")]
     if not moments:
-        text = "None: no end of a segment is probably more than 8 cm off, except where it is so in most frames."
+        text = "None: no end of a segment is probably more than 5 cm off, except where it is so in most frames."
         return [p.callout("good", text)]
     out = [time_line(motion, moments)]
     for m in moments[:MOMENTS]:
