@@ -63,7 +63,7 @@ OPTIONS = ("unit", "up", "names", "rest")
 
 _UNITS, _RESTS, _UPS = ("m", "cm", "mm"), ("body", "t"), ("x", "y", "z", "-x", "-y", "-z")
 _Y_UPS, _Z_UPS = ("y", "x", "z", *_UPS[3:]), ("z", "x", "y", *_UPS[3:])
-_JOINTS = ("kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh")
+_JOINTS = ("kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh", "vrm", "unity", "unreal")
 _BVH, _HANIM = ((first, *(name for name in _JOINTS if name != first)) for first in ("bvh", "hanim"))
 _OPENSIM = "OpenSim files are in metres, y up, with the names of the body's coordinates"
 

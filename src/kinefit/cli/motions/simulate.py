@@ -32,15 +32,15 @@ def _choices(format: str) -> str:
 _EXAMPLES = """\b
 Examples:
   kinefit export take-kinefit/motion.npz --to bvh --unit m            upright and of the right size in Blender
-  kinefit export motion.npz --to glb --names mixamo                   retargets by name in Blender, Unity, Unreal
+  kinefit export motion.npz --to glb --names unreal                   bones as Unreal's mannequin has them
   kinefit export motion.npz --to usd --up z --out walk.usda
   kinefit export motion.npz --to trc --out walk.trc --unit mm
   kinefit export motion.npz --to parquet --out tables
   kinefit export motion.npz --retarget character.glb                  the motion on another character's mesh
 
 \b
-Values of each format, default first (csv, parquet, c3d, nwb, rrd, jsonl keep the vertical axis; --names mixamo has
-rest pose t):
+Values of each format, default first (csv, parquet, c3d, nwb, rrd, jsonl keep the vertical axis; --names mixamo, vrm,
+unity and unreal have rest pose t):
 """ + "".join(f"  {format:<8} {_choices(format)}\n" for format in NAMES)
 
 
@@ -71,7 +71,7 @@ def _format(ctx: click.Context, parameter: click.Parameter, value: str | None) -
 @click.option("-o", "--out", type=_screen.PATH, help="File or folder.  [default: next to MOTION]")
 @click.option("--unit", metavar="UNIT", help="Unit of length: m, cm or mm.")
 @click.option("--up", metavar="AXIS", help="Vertical axis: x, y, z, -x, -y or -z.")
-@click.option("--names", metavar="NAMES", help="Names of joints: kinefit, mixamo, cmu, opensim, hanim or bvh.")
+@click.option("--names", metavar="NAMES", help=f"Names of joints: {', '.join(FORMATS.get('glb').names)}.")
 @click.option("--rest", metavar="POSE", help="Rest pose: body (arms hanging, facing x) or t (a T facing z).")
 @click.option("--cylinders", is_flag=True, help="GLB and USD: write the body's cylinders instead of a skin.")
 @_screen.verbose_option

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body
+from kinefit.bodies.joint_names import CHARACTER_BONES, segment_names
 from kinefit.errors import ExportError, check_choice, spelled
 from kinefit.geometry import se3
 from kinefit.motion import UP_AXES, Motion, continuous_quaternions
 from kinefit.rendering.looks import TubeMesh
 
-NAMES = ("kinefit", "bvh", "mixamo", "cmu", "opensim", "hanim")
-"""Conventions of names: the body's own, then its aliases."""
+NAMES = ("kinefit", "bvh", "mixamo", "cmu", "opensim", "hanim", *CHARACTER_BONES)
+"""Conventions of names: the body's own, its aliases, those of characters in game engines."""
 
 UNITS = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 """Units of length in a metre."""
@@ -83,11 +84,12 @@ def bone_names(body: Body, names: str, path: str | PathLike[str]) -> list[str]:
     """
     names = convention(names)
     check_choice("convention of names", names, NAMES, ExportError, file=path)
-    if names not in ("kinefit", "bvh") and not body.aliases.get(names):
-        known = ", ".join(["kinefit", *(name for name in NAMES if body.aliases.get(name))])
+    found = segment_names(body, names)
+    if names not in ("kinefit", "bvh") and not found:
+        known = ", ".join(["kinefit", *(name for name in NAMES if segment_names(body, name))])
         remedy = f"It has those of: {known}. Or write them into its body file: names = {{ {names} = ... }}."
         raise ExportError(f"body '{body.name}' has no names of {names}", file=path, remedy=remedy)
-    return plain_names(body.alias(names, segment) for segment in body.tree.segments)
+    return plain_names(found.get(segment, segment) for segment in body.tree.segments)
 
 
 def convention(names: str) -> str:
@@ -124,6 +126,8 @@ def plain_names(names: Iterable[str]) -> list[str]:
         out.append(plain)
     return out
 
+
+_T_NAMES = ("mixamo", *CHARACTER_BONES)  # whose characters rest with arms out to the sides, or nearly so
 
 RESTS = ("body", "t")
 """Rest poses: the body's own (arms hanging, facing x), or arms out to the sides, palms down, facing z."""
@@ -188,14 +192,14 @@ class Rest:
 
 
 def rest_pose(body: Body, rest: str | None, names: str, path: str | PathLike[str]) -> Rest:
-    """A rest pose of `RESTS`; None: "t" where joints are named as Mixamo's, whose figures rest so, else "body".
+    """A rest pose of `RESTS`; None: "t" with the names of Mixamo, VRM, Unity or Unreal, else "body".
 
     Raises
     ------
     ExportError
         An unknown rest pose; `path` for the message.
     """
-    rest = rest or ("t" if convention(names) == "mixamo" else "body")
+    rest = rest or ("t" if convention(names) in _T_NAMES else "body")
     check_choice("rest pose", rest, RESTS, ExportError, file=path)
     count = len(body.tree.segments)
     turns = np.tile(np.eye(3), (count, 1, 1)) if rest == "body" else np.stack([_turn(body, s) for s in range(count)])

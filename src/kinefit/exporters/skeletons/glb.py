@@ -51,10 +51,11 @@ def write_glb(
     ----------
     motion : Motion
     path : path
-    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh"
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh", "vrm", "unity" or "unreal"
         Names of the joints.
     rest : "body" or "t", optional
-        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with Mixamo's names.
+        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with the
+        names of Mixamo, VRM, Unity and Unreal.
     cylinders : bool
         The body's cylinders in place of a skin.
 
@@ -182,10 +183,11 @@ def write_usd(
         Ending in .usdc (binary), .usda (text) or .usd.
     unit : "m", "cm" or "mm"
     up : "y" or "z"
-    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh"
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh", "vrm", "unity" or "unreal"
         Names of the joints.
     rest : "body" or "t", optional
-        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with Mixamo's names.
+        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with the
+        names of Mixamo, VRM, Unity and Unreal.
     cylinders : bool
         The body's cylinders in place of a skin.
 
