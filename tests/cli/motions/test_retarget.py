@@ -12,7 +12,6 @@ from kinefit.motion import rotation_between_up
 from kinefit.simulation import cut, squat_and_wave
 
 
-
 def run(*args):
     told = CliRunner().invoke(main, [str(arg) for arg in args])
     assert told.exit_code == 0, told.output

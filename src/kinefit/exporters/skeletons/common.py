@@ -14,7 +14,7 @@ from kinefit.bodies import Body
 from kinefit.bodies.joint_names import CHARACTER_BONES, segment_names
 from kinefit.errors import ExportError, check_choice, spelled
 from kinefit.geometry import se3
-from kinefit.motion import UP_AXES, Motion, continuous_quaternions
+from kinefit.motion import UP_AXES, Motion, continuous_quaternions, rotation_between_up
 from kinefit.rendering.looks import TubeMesh
 
 NAMES = ("kinefit", "bvh", "mixamo", "cmu", "opensim", "hanim", *CHARACTER_BONES)
@@ -30,6 +30,13 @@ def moving_segments(body: Body) -> NDArray:
     """(S,) bool: the root, and segments whose joint can slide, so that their offset changes."""
     out = np.zeros(len(body.tree.segments), bool)
     out[body.tree.owners[body.tree.prismatic]] = out[0] = True
+    return out
+
+
+def turning_segments(body: Body) -> NDArray:
+    """(S,) bool: the root, and segments whose joint can turn."""
+    out = np.zeros(len(body.tree.segments), bool)
+    out[body.tree.owners[~body.tree.prismatic]] = out[0] = True
     return out
 
 
@@ -53,11 +60,15 @@ def euler_zxy(rotations: NDArray, before: NDArray | None = None) -> NDArray:
     return out
 
 
-def euler(rotations: NDArray, axes: str) -> NDArray:
-    """(F, 3) [rad] angles about three different body-fixed axes in this order, without jumps, of (F, 3, 3)."""
+def euler(rotations: NDArray, axes: str, before: NDArray | None = None) -> NDArray:
+    """Angles (F, ..., 3) [rad] about three different body-fixed axes in this order, of rotations (F, ..., 3, 3).
+
+    They do not jump over F, as of `euler_zxy`. `before` (..., 3) are the angles of the frame before the first.
+    """
     i, j, k = ("xyz".index(axis) for axis in axes)
-    as_zxy = rotations[:, [[j], [k], [i]], [j, k, i]]  # axes renamed; where that mirrors, turns go the other way
-    return euler_zxy(as_zxy) * (1.0 if (j - i) % 3 == 1 else -1.0)
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    as_zxy = rotations[..., [[j], [k], [i]], [j, k, i]]  # axes renamed; where that mirrors, turns go the other way
+    return sign * euler_zxy(as_zxy, None if before is None else sign * before)
 
 
 def _nearest_zxy(R: NDArray, before: NDArray) -> NDArray:
@@ -174,6 +185,14 @@ class Rest:
             turns.append(continuous_quaternions(Ts[..., :3, :3], turns[-1][-1] if turns else None))
             places.append(Ts[..., :3, 3].copy())
         return np.concatenate(turns), np.concatenate(places)
+
+    def matrices(self, up: str, factor: float) -> tuple[NDArray, NDArray]:
+        """Poses (S, 4, 4) of bones in their parent's frame and in the world of `up`; lengths times `factor`."""
+        upright = se3.transform(rotation_between_up("y", up), np.zeros(3))
+        local = np.tile(np.eye(4), (len(self.offsets), 1, 1))
+        local[:, :3, 3] = factor * self.offsets
+        local[0] = upright @ local[0]
+        return local, upright @ se3.transform(np.eye(3), factor * self.positions)
 
     def posed(self, mesh: TubeMesh, body: Body) -> TubeMesh:
         """A mesh about the body, which rests as the body does, in this rest pose."""
