@@ -15,8 +15,8 @@ scene = bpy.context.scene
 first, last = figure.animation_data.action.frame_range
 told = {
     "fps": scene.render.fps / scene.render.fps_base, "frames": [first, last], "heads": [], "points": [],
-    "groups": [group.name for group in skin.vertex_groups], "materials": [m.name for m in skin.data.materials],
-    "colours": len(skin.data.color_attributes),
+    "groups": [group.name for group in skin.vertex_groups],
+    "colours": [list(skin.data.materials[face.material_index].diffuse_color)[:3] for face in skin.data.polygons],
 }  # fmt: skip
 for frame in frames:
     scene.frame_set(round(first) + frame)

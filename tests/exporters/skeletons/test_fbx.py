@@ -1,4 +1,4 @@
-"""FBX, as ufbx reads it: joints, skin, unit, axes, rate; with bpy (`KINEFIT_BPY_PYTHON`, or installed) in Blender, too."""
+"""FBX, as ufbx reads it: joints, skin, unit, axes, rate; in Blender with bpy (`KINEFIT_BPY_PYTHON`, or installed)."""
 
 import importlib.util
 import json
@@ -214,4 +214,6 @@ def test_blender_opens_it_upright_at_true_size_and_rate(motion, tmp_path, import
         assert np.linalg.norm(np.array(points) - surface(motion, "z", frame), axis=1).max() < 1e-3
     mesh, bones = body_mesh(motion.body), bone_names(motion.body, "unreal", "")
     assert {bones[s] for s in np.unique(mesh.segments[mesh.weights > 0])} <= set(told["groups"]) <= set(bones)
-    assert told["materials"] == ["skin"] and told["colours"] == 1
+    colours = (mesh.colours[mesh.triangles[:, 0]] / 255.0) ** 2.2
+    assert np.abs(np.array(told["colours"]) - colours).max() < 0.01
+    assert np.ptp(colours, axis=0).max() > 0.3  # left, middle and right

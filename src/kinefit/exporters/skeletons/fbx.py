@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
@@ -44,7 +44,7 @@ _FILE_ID = bytes.fromhex("28b32aebb624ccc2bfc8b02aa92bfcf1")
 _FOOT_ID = bytes.fromhex("fabcab09d0c8d466b176fb831cf7267e")
 _FOOT_END = bytes.fromhex("f85a8c6adef5d97eece90ce3758f290b")
 _UPS = {"y": (1, 1, 2, 1), "z": (2, 1, 1, -1)}  # vertical axis, its sign, the axis to the viewer, its sign
-_TIME_MODES = {120: 1, 100: 2, 60: 3, 50: 4, 48: 5, 30: 6, 25: 10, 24: 11, 1000: 12, 96: 15, 72: 16}  # by frames a second
+_TIME_MODES = {120: 1, 100: 2, 60: 3, 50: 4, 48: 5, 30: 6, 25: 10, 24: 11, 1000: 12, 96: 15, 72: 16}  # of a rate [Hz]
 _TIME_MODE_CUSTOM = 14
 _LINEAR_KEY = 4  # flag of a key: straight to the next one
 _DEFAULT_TANGENT = np.array([0, 0, 0x0D050D05, 0], np.uint32).view(np.float32)  # slopes 0, weights of a third
@@ -87,12 +87,12 @@ def write_fbx(
     joints, pose = bone_names(body, names, path), rest_pose(body, rest, names, path)
     mesh = pose.posed(body_mesh(body, cylinders=cylinders), body)
     pose, mesh = _on_the_ground(pose, mesh)
-    scene = _Scene()
-    bones = _add_bones(scene, body, joints, pose, up, factor)
-    _add_bind_pose(scene, bones, _add_skin(scene, body, mesh, bones, joints, pose, up, factor), pose, up, factor)
+    scene = _Scene(*pose.matrices(up, factor), factor)
+    bones = _add_bones(scene, body, joints)
+    _add_bind_pose(scene, bones, _add_skin(scene, body, mesh, dict(zip(joints, bones))))
     ticks = np.rint((world.times - world.times[0]) * TICKS_PER_S).astype(np.int64)
     clip = plain_names([motion.name])[0]
-    _add_animation(scene, clip, world, pose, bones, ticks, factor)
+    _add_animation(scene, clip, world, pose, bones, ticks)
     records = [*_head(), _settings(motion.rate, ticks, up, factor), *scene.records(clip, ticks)]
     with writing(path) as temporary, temporary.open("wb") as file:
         file.writelines(_file(records))
@@ -135,7 +135,7 @@ _EMPTY = bytes(_HEAD.size)
 
 
 def record(name: str, *values: Any, inside: Iterable[Record] = ()) -> Record:
-    """A node with values: bool, int (32 bits), numpy.int64, float, text, bytes, arrays (N,), or an encoded one."""
+    """A node with values: bool, int (32 bits), numpy's integer (64 bits), float, text, bytes, array (N,) or encoded."""
     return Record(name, tuple(map(_encoded, values)), tuple(inside))
 
 
@@ -149,7 +149,7 @@ def _encoded(value: Any) -> bytes:
             return value
         case bool():
             return b"C" + struct.pack("<?", value)
-        case np.int64():
+        case np.integer():
             return b"L" + struct.pack("<q", value)
         case int():
             return b"I" + struct.pack("<i", value)
@@ -214,9 +214,16 @@ def _settings(rate: float, ticks: NDArray, up: str, factor: float) -> Record:
 
 
 class _Scene:
-    """Objects of a file and what joins them."""
+    """Objects of a file and what joins them; of the figure at rest, lengths in the file's unit.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    local, bind : (S, 4, 4) poses of bones in their parents and in the world.
+    factor : units of length in a metre.
+    """
+
+    def __init__(self, local: NDArray, bind: NDArray, factor: float) -> None:
+        self.local, self.bind, self.factor = local, bind, factor
         self._objects, self._links = list[Record](), list[Record]()
 
     def add(self, kind: str, name: str, class_name: str, sub: str, *inside: Record) -> np.int64:
@@ -268,17 +275,14 @@ def _model(*placed: tuple[Any, ...]) -> tuple[Record, ...]:
     return record("Version", 232), shown, record("Shading", True), record("Culling", "CullingOff")
 
 
-def _add_bones(
-    scene: _Scene, body: Body, names: list[str], pose: Rest, up: str, factor: float
-) -> list[np.int64]:
+def _add_bones(scene: _Scene, body: Body, names: list[str]) -> list[np.int64]:
     """Add a bone for each segment, at rest; their numbers."""
-    local, _ = pose.matrices(up, factor)
-    angles = np.degrees(euler(local[None, :, :3, :3], "zyx"))[0, :, ::-1]
+    angles = np.degrees(euler(scene.local[None, :, :3, :3], "zyx"))[0, :, ::-1]
     bones = list[np.int64]()
     for s, name in enumerate(names):
         shown = scene.add("NodeAttribute", name, "NodeAttribute", "LimbNode", record("TypeFlags", "Skeleton"))
         bones.append(scene.add("Model", name, "Model", "LimbNode", *_model(
-            ("Lcl Translation", "Lcl Translation", "", "A", *local[s, :3, 3].tolist()),
+            ("Lcl Translation", "Lcl Translation", "", "A", *scene.local[s, :3, 3].tolist()),
             ("Lcl Rotation", "Lcl Rotation", "", "A", *angles[s].tolist()),
         )))  # fmt: skip
         scene.join(shown, bones[s])
@@ -287,61 +291,55 @@ def _add_bones(
     return bones
 
 
-def _add_skin(
-    scene: _Scene, body: Body, mesh: TubeMesh, bones: list[np.int64], names: list[str], pose: Rest, up: str,
-    factor: float,
-) -> list[np.int64]:  # fmt: skip
-    """Add a mesh that follows the bones; its number, none of a body without surfaces."""
+def _add_skin(scene: _Scene, body: Body, mesh: TubeMesh, bones: Mapping[str, np.int64]) -> list[np.int64]:
+    """Add a mesh that follows bones {name: number}; its number, none of a body without surfaces."""
     if not len(mesh.vertices):
         return []
-    _, bind = pose.matrices(up, factor)
-    R = bind[0, :3, :3]
+    R = scene.bind[0, :3, :3]
     corners = mesh.triangles.astype(np.int32)
     last = corners * np.array([1, 1, -1], np.int32) - np.array([0, 0, 1], np.int32)  # of a polygon: -1 - index
-    colours = np.pad(mesh.colours / 255.0, ((0, 0), (0, 1)), constant_values=1.0)
+    colours, of_faces = np.unique(mesh.colours[corners[:, 0]], axis=0, return_inverse=True)
     layers = [
-        _layer("Normal", "Normals", mesh.normals[corners.ravel()] @ R.T),
-        _layer("Color", "Colors", colours, record("ColorIndex", corners.ravel())),
-        record("LayerElementMaterial", 0, inside=[
-            record("Version", 101), record("Name", ""), record("MappingInformationType", "AllSame"),
-            record("ReferenceInformationType", "IndexToDirect"), record("Materials", np.zeros(1, np.int32)),
-        ]),
-    ]  # fmt: skip
+        _layer("Normal", "ByPolygonVertex", "Direct", record("Normals", (mesh.normals[corners.ravel()] @ R.T).ravel())),
+        _layer("Material", "ByPolygon", "IndexToDirect", record("Materials", of_faces.ravel().astype(np.int32))),
+    ]
     listed = [record("LayerElement", inside=[record("Type", each.name), record("TypedIndex", 0)]) for each in layers]
     shape = scene.add(
         "Geometry", "surface", "Geometry", "Mesh",
-        record("Vertices", (factor * mesh.vertices @ R.T).ravel()), record("PolygonVertexIndex", last.ravel()),
+        record("Vertices", (scene.factor * mesh.vertices @ R.T).ravel()), record("PolygonVertexIndex", last.ravel()),
         record("GeometryVersion", 124), *layers, record("Layer", 0, inside=[record("Version", 100), *listed]),
     )  # fmt: skip
     model = scene.add("Model", plain_names([body.name])[0], "Model", "Mesh", *_model())
-    look = scene.add(
-        "Material", "skin", "Material", "", record("Version", 102), record("ShadingModel", "lambert"),
-        _table(("DiffuseColor", "Color", "", "A", 1.0, 1.0, 1.0)),
-    )
     skin = scene.add("Deformer", "skin", "Deformer", "Skin", record("Version", 101), record("Link_DeformAcuracy", 50.0))
-    for child, parent in ((model, np.int64(0)), (shape, model), (look, model), (skin, shape)):
+    for child, parent in ((model, np.int64(0)), (shape, model), (skin, shape)):
         scene.join(child, parent)
-    for s, bone in enumerate(bones):
+    for colour in colours:
+        linear = ((colour / 255.0) ** 2.2).tolist()  # of sRGB
+        look = scene.add(
+            "Material", f"skin_{colour.tobytes().hex()}", "Material", "", record("Version", 102),
+            record("ShadingModel", "lambert"), _table(("DiffuseColor", "Color", "", "A", *linear)),
+        )  # fmt: skip
+        scene.join(look, model)
+    for s, (name, bone) in enumerate(bones.items()):
         weights = np.where(mesh.segments == s, mesh.weights, 0.0).sum(axis=1)
         followers = np.flatnonzero(weights)
         if len(followers):
             cluster = scene.add(
-                "Deformer", names[s], "SubDeformer", "Cluster", record("Version", 100), record("UserData", "", ""),
+                "Deformer", name, "SubDeformer", "Cluster", record("Version", 100), record("UserData", "", ""),
                 record("Indexes", followers.astype(np.int32)), record("Weights", weights[followers]),
-                record("Transform", _by_columns(np.linalg.inv(bind[s]))),
-                record("TransformLink", _by_columns(bind[s])),
+                record("Transform", _by_columns(np.linalg.inv(scene.bind[s]))),
+                record("TransformLink", _by_columns(scene.bind[s])),
             )  # fmt: skip
             scene.join(cluster, skin)
             scene.join(bone, cluster)
     return [model]
 
 
-def _layer(kind: str, key: str, values: NDArray, *indices: Record) -> Record:
-    """A layer of a mesh with a value for each corner, or an index of one."""
+def _layer(kind: str, mapping: str, reference: str, values: Record) -> Record:
+    """A layer of a mesh: values of corners or faces, or indices of them."""
     return record(f"LayerElement{kind}", 0, inside=[
-        record("Version", 101), record("Name", ""), record("MappingInformationType", "ByPolygonVertex"),
-        record("ReferenceInformationType", "IndexToDirect" if indices else "Direct"), record(key, values.ravel()),
-        *indices,
+        record("Version", 101), record("Name", ""), record("MappingInformationType", mapping),
+        record("ReferenceInformationType", reference), values,
     ])  # fmt: skip
 
 
@@ -350,24 +348,22 @@ def _by_columns(T: NDArray) -> NDArray:
     return T.T.ravel()
 
 
-def _add_bind_pose(
-    scene: _Scene, bones: list[np.int64], meshes: list[np.int64], pose: Rest, up: str, factor: float
-) -> None:
-    placed = [*zip(bones, pose.matrices(up, factor)[1]), *((mesh, np.eye(4)) for mesh in meshes)]
+def _add_bind_pose(scene: _Scene, bones: list[np.int64], meshes: list[np.int64]) -> None:
+    placed = [*zip(bones, scene.bind), *((mesh, np.eye(4)) for mesh in meshes)]
     nodes = [record("PoseNode", inside=[record("Node", n), record("Matrix", _by_columns(T))]) for n, T in placed]
-    kind = record("Type", "BindPose")
-    scene.add("Pose", "rest", "Pose", "BindPose", kind, record("Version", 100), record("NbPoseNodes", len(nodes)), *nodes)
+    head = [record("Type", "BindPose"), record("Version", 100), record("NbPoseNodes", len(nodes))]
+    scene.add("Pose", "rest", "Pose", "BindPose", *head, *nodes)
 
 
 def _add_animation(
-    scene: _Scene, clip: str, motion: Motion, pose: Rest, bones: list[np.int64], ticks: NDArray, factor: float
+    scene: _Scene, clip: str, motion: Motion, pose: Rest, bones: list[np.int64], ticks: NDArray
 ) -> None:
     """Add keys of every frame: the root turns and moves, other joints as they can."""
     span = [(f"{of}{end}", at) for of in ("Local", "Reference") for end, at in zip(("Start", "Stop"), ticks[[0, -1]])]
     stack = scene.add("AnimationStack", clip, "AnimStack", "", _table(*(_time(name, at) for name, at in span)))
     layer = scene.add("AnimationLayer", clip, "AnimLayer", "")
     scene.join(layer, stack)
-    angles, places = _local_courses(motion, pose, factor)
+    angles, places = _local_courses(motion, pose, scene.factor)
     times = _Encoded(_encoded(ticks))
     turning, moving = turning_segments(motion.body), moving_segments(motion.body)
     for s, bone in enumerate(bones):
