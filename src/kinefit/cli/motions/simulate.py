@@ -144,7 +144,7 @@ def _choice(format: str, key: str, value: str) -> str:
     valid = getattr(chosen, key)
     if value in valid:
         return value
-    why = f"{chosen.why}. " if chosen.why and (not valid or key == "up" and "x" not in valid) else ""
+    why = f"{chosen.why}. " if chosen.why and (not valid or (key == "up" and "x" not in valid)) else ""
     if valid:
         raise click.UsageError(f"{why}--{key} {value} is not possible for {format}. Give one of: {', '.join(valid)}.")
     others = [name for name in FORMATS.built_in if getattr(FORMATS.get(name), key)]
