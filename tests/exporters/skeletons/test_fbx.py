@@ -102,6 +102,15 @@ def test_bones_have_the_names_and_parents_of_the_body(motion, tmp_path, names):
     assert sorted(told["nodes"]) == sorted(["", motion.body.name, *bones])
 
 
+def test_names_that_repeat_or_are_not_english_stay_apart(motion, tmp_path):
+    names = {"pelvis": "Hüfte", "head": "Hüfte", "hand_l": "a/b c"}
+    odd = replace(motion, body=replace(motion.body, name="Hüfte", aliases={"mixamo": names}), name="Lauf 1: größer")
+    write_fbx(odd, tmp_path / "a.fbx", names="mixamo")
+    told = read(tmp_path / "a.fbx")
+    assert {"Hüfte", "Hüfte_2", "Hüfte_3", "a_b_c"} <= set(told["nodes"])
+    assert told["clips"][0][0] == "Lauf_1:_größer" and len(told["skin"]) == len(motion.body.tree.segments)
+
+
 def test_the_skin_follows_the_bones_with_the_weights_of_the_mesh(motion, file):
     mesh = body_mesh(motion.body)
     ((count, faces, points),) = file["meshes"]

@@ -89,7 +89,8 @@ def write_fbx(
     pose, mesh = _on_the_ground(pose, mesh)
     scene = _Scene(*pose.matrices(up, factor), factor)
     bones = _add_bones(scene, body, joints)
-    _add_bind_pose(scene, bones, _add_skin(scene, body, mesh, dict(zip(joints, bones))))
+    figure = plain_names([*joints, body.name])[-1]
+    _add_bind_pose(scene, bones, _add_skin(scene, figure, mesh, dict(zip(joints, bones))))
     ticks = np.rint((world.times - world.times[0]) * TICKS_PER_S).astype(np.int64)
     clip = plain_names([motion.name])[0]
     _add_animation(scene, clip, world, pose, bones, ticks)
@@ -291,7 +292,7 @@ def _add_bones(scene: _Scene, body: Body, names: list[str]) -> list[np.int64]:
     return bones
 
 
-def _add_skin(scene: _Scene, body: Body, mesh: TubeMesh, bones: Mapping[str, np.int64]) -> list[np.int64]:
+def _add_skin(scene: _Scene, name: str, mesh: TubeMesh, bones: Mapping[str, np.int64]) -> list[np.int64]:
     """Add a mesh that follows bones {name: number}; its number, none of a body without surfaces."""
     if not len(mesh.vertices):
         return []
@@ -309,7 +310,7 @@ def _add_skin(scene: _Scene, body: Body, mesh: TubeMesh, bones: Mapping[str, np.
         record("Vertices", (scene.factor * mesh.vertices @ R.T).ravel()), record("PolygonVertexIndex", last.ravel()),
         record("GeometryVersion", 124), *layers, record("Layer", 0, inside=[record("Version", 100), *listed]),
     )  # fmt: skip
-    model = scene.add("Model", plain_names([body.name])[0], "Model", "Mesh", *_model())
+    model = scene.add("Model", name, "Model", "Mesh", *_model())
     skin = scene.add("Deformer", "skin", "Deformer", "Skin", record("Version", 101), record("Link_DeformAcuracy", 50.0))
     for child, parent in ((model, np.int64(0)), (shape, model), (skin, shape)):
         scene.join(child, parent)
@@ -320,12 +321,12 @@ def _add_skin(scene: _Scene, body: Body, mesh: TubeMesh, bones: Mapping[str, np.
             record("ShadingModel", "lambert"), _table(("DiffuseColor", "Color", "", "A", *linear)),
         )  # fmt: skip
         scene.join(look, model)
-    for s, (name, bone) in enumerate(bones.items()):
+    for s, (bone_name, bone) in enumerate(bones.items()):
         weights = np.where(mesh.segments == s, mesh.weights, 0.0).sum(axis=1)
         followers = np.flatnonzero(weights)
         if len(followers):
             cluster = scene.add(
-                "Deformer", name, "SubDeformer", "Cluster", record("Version", 100), record("UserData", "", ""),
+                "Deformer", bone_name, "SubDeformer", "Cluster", record("Version", 100), record("UserData", "", ""),
                 record("Indexes", followers.astype(np.int32)), record("Weights", weights[followers]),
                 record("Transform", _by_columns(np.linalg.inv(scene.bind[s]))),
                 record("TransformLink", _by_columns(scene.bind[s])),
