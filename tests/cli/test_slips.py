@@ -166,12 +166,6 @@ def test_an_out_that_cannot_be_written_is_refused_before_any_work(take, words):
     assert "Give another" in told.stderr and words[-2] in told.stderr
 
 
-def test_fbx_is_answered_with_glb_and_bvh():
-    for words in (("export", "motion.npz", "--to", "fbx"), ("track", "take.toml", "--formats", "fbx")):
-        told = run(*words)
-        assert told.exit_code == 2 and "use glb or bvh" in told.stderr
-
-
 @pytest.mark.parametrize(
     ("words", "meant"),
     [

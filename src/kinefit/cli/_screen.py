@@ -284,10 +284,7 @@ class CommandGroup(click.Group):
 
 def no_format(name: str, valid: Iterable[str]) -> str:
     """What to say of a format that there is not."""
-    problem = choices("format", name, valid)
-    if name.lower().strip(".") == "fbx":
-        return f"{problem}. kinefit does not write FBX: use glb or bvh, which Blender, Unity and Unreal import"
-    return f"{problem}. {install('format')}"
+    return f"{choices('format', name, valid)}. {install('format')}"
 
 
 def check_folder(folder: Path, option: str = "--out") -> None:

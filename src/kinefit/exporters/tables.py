@@ -225,7 +225,7 @@ def tables(
         Of all lengths.
     up : str, optional
         Vertical axis of the tables' world; default: the motion's own.
-    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh", optional
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh", "vrm", "unity" or "unreal", optional
         Joints and segments under these names (a joint bears its segment's); default: the body's own for both.
 
     Raises

@@ -27,9 +27,9 @@ from kinefit.exporters.skeletons.common import (
     plain_names,
     rest_pose,
     turned,
+    turning_segments,
 )
-from kinefit.geometry import se3
-from kinefit.motion import Motion, rotation_between_up
+from kinefit.motion import Motion
 from kinefit.rendering.looks import TubeMesh, body_mesh
 
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
@@ -51,10 +51,11 @@ def write_glb(
     ----------
     motion : Motion
     path : path
-    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh"
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh", "vrm", "unity" or "unreal"
         Names of the joints.
     rest : "body" or "t", optional
-        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with Mixamo's names.
+        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with the
+        names of Mixamo, VRM, Unity and Unreal.
     cylinders : bool
         The body's cylinders in place of a skin.
 
@@ -151,11 +152,9 @@ def _add_skin(file: GltfFile, mesh: TubeMesh, pose: Rest) -> None:
 
 
 def _courses(motion: Motion, pose: Rest) -> Iterator[tuple[int, str, NDArray]]:
-    tree, moving = motion.body.tree, moving_segments(motion.body)
+    moving, turning = moving_segments(motion.body), turning_segments(motion.body)
     turns, places = pose.local_moves(motion, "y")
-    turning = np.zeros(len(tree.segments), bool)
-    turning[tree.owners[~tree.prismatic]] = turning[0] = True
-    for s in range(len(tree.segments)):
+    for s in range(len(moving)):
         if turning[s]:
             yield s, "rotation", turns[:, s]
         if moving[s]:
@@ -182,10 +181,11 @@ def write_usd(
         Ending in .usdc (binary), .usda (text) or .usd.
     unit : "m", "cm" or "mm"
     up : "y" or "z"
-    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh"
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh", "vrm", "unity" or "unreal"
         Names of the joints.
     rest : "body" or "t", optional
-        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with Mixamo's names.
+        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with the
+        names of Mixamo, VRM, Unity and Unreal.
     cylinders : bool
         The body's cylinders in place of a skin.
 
@@ -242,7 +242,7 @@ def _fill(stage: Any, motion: Motion, pose: Rest, joints: list[str], factor: flo
     root = UsdSkel.Root.Define(stage, "/Figure")
     stage.SetDefaultPrim(root.GetPrim())
     skeleton = UsdSkel.Skeleton.Define(stage, "/Figure/Skeleton")
-    rest, bind = _rest_poses(motion.body, pose, motion.up, factor)
+    rest, bind = pose.matrices(motion.up, factor)
     skeleton.CreateJointsAttr(joints)
     skeleton.CreateRestTransformsAttr([Gf.Matrix4d(T.T.tolist()) for T in rest])  # USD multiplies rows
     skeleton.CreateBindTransformsAttr([Gf.Matrix4d(T.T.tolist()) for T in bind])
@@ -264,15 +264,6 @@ def _reach(surface: Surface) -> float:
     if isinstance(surface, MeshSurface):
         return float(np.linalg.norm(surface.vertices, axis=1).max())
     return max(float(np.linalg.norm(end)) + max(r) for end, r in zip((surface.start, surface.end), surface.radii))
-
-
-def _rest_poses(body: Body, pose: Rest, up: str, factor: float) -> tuple[NDArray, NDArray]:
-    """Poses (S, 4, 4) at rest in the parent's frame and in the skeleton's, upright; lengths in the file's unit."""
-    upright = se3.transform(rotation_between_up("y", up), np.zeros(3))
-    local = np.tile(np.eye(4), (len(body.tree.segments), 1, 1))
-    local[:, :3, 3] = factor * pose.offsets
-    local[0] = upright @ local[0]
-    return local, upright @ se3.transform(np.eye(3), factor * pose.positions)
 
 
 def _animation(stage: Any, motion: Motion, pose: Rest, joints: list[str], factor: float) -> Any:
