@@ -175,7 +175,7 @@ Examples:
 @click.option("--static", type=_screen.PATH, help="Labelled static trial of the same subject.")
 @click.option("--body", default="humanoid", show_default=True, help="Body of the catalogue, or a body file.")
 @click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the set that has the labels]")
-@click.option("--height", type=click.FloatRange(0.5, 2.6), metavar="M", help="Height of the subject, barefoot [m].")
+@click.option("--height", type=_screen.HEIGHT, metavar="M", help="Height of the subject, barefoot [m].")
 @click.option("--up", type=click.Choice(["x", "y", "z"]), help="Vertical axis.  [default: estimated]")
 @click.option("--sides", type=click.Choice(["labelled", "exchanged", "mirrored-x", "mirrored-y", "mirrored-z"]),
               help="How left and right are read: exchanged labels, a world with one axis negated, or as labelled "
