@@ -182,7 +182,7 @@ Examples:
               "without a check.  [default: as labelled, checked]")
 @click.option("--limits/--no-limits", default=True, show_default=True, help="Keep joint angles within their limits.")
 @click.option("--smooth/--no-smooth", default=True, show_default=True, help="Fit all frames together, or each alone.")
-@click.option("--formats", metavar="LIST", help="Formats to write.  [default: motion,mot,osim,trc,bvh,glb,markers]")
+@click.option("--formats", metavar="LIST", help="Formats to write.  [default: all of motion,csv,bvh,glb,trc,mot,osim,markers,report]")
 @_unit
 @_screen.verbose_option
 def fit(
@@ -191,7 +191,7 @@ def fit(
     unit: str | None,
 ) -> None:  # fmt: skip
     """Fit a body to markers: size and marker offsets from all frames, then joint angles."""
-    from kinefit.cli._summary import print_summary
+    from kinefit.cli._summary import print_files, print_summary
     from kinefit.cli.markers._fit import WRITTEN, MarkerFitOptions, fit_file, identify_file
 
     out = out or take.with_name(f"{take.stem}-kinefit")
@@ -213,10 +213,8 @@ def fit(
         _screen.tell_finding(note)
     for motion, _ in found.values():
         print_summary(motion, points=_screen.is_verbose())
-    _screen.say("\nWritten:")
-    written = [files] if subjects else []
-    for path in (path for group in (*written, *(w for _, w in found.values())) for path in group.values()):
-        _screen.say(f"  {path}")
+    for written in (*([files] if subjects else []), *(w for _, w in found.values())):
+        print_files(written)
 
 
 @markers.command(epilog="""\b

@@ -41,7 +41,9 @@ from kinefit.exporters.report.moments import (
     doubtful_moments,
     never_observed,
     shared_by_prior,
+    spoken_segments,
     throughout_sentence,
+    unmarked,
 )
 from kinefit.exporters.tables import curves, spoken
 from kinefit.findings import listed, of_provenance
@@ -198,8 +200,11 @@ def _trust(motion: Motion, moments: Sequence[Moment]) -> tuple[str, str]:
     poor = float(np.mean(motion.quality < POORLY_SUPPORTED))
     unobserved = float(np.mean(motion.quality <= 0))
     wrong = unobserved > 0.1 or poor > 0.5 or of_provenance(motion.provenance)
-    severity = "bad" if wrong else "warning" if moments else "good"
+    throughout = throughout_sentence(motion)
+    severity = "bad" if wrong else "warning" if moments or throughout else "good"
     parts = [trust_sentence(motion, moments)]
+    if throughout:
+        parts.append(f" Uncertain in most frames, at the far end (2 σ): {throughout}.")
     if moments:
         parts += [" See ", p.link("doubtful-moments", "where and why"), "."]
     if unobserved:
@@ -255,6 +260,11 @@ def _limits(motion: Motion) -> list[p.Html]:
         parts.append(p.callout("warning", f"Constant shift in {shifts}.", text))
     if throughout := throughout_sentence(motion):
         parts.append(p.callout("note", f"Uncertain in most frames, at the far end (2 σ): {throughout}."))
+    bare = np.flatnonzero(2 * unmarked(motion).sum(axis=0) > len(motion))
+    if len(bare):
+        names = spoken_segments(motion.body, [motion.body.tree.segments[s] for s in bare], 20)
+        text = "They have no markers: their pose follows their neighbours and the posture prior, and is no result."
+        parts.append(p.callout("note", f"Not observed: {names}.", text))
     blind = never_observed(motion)
     if blind:
         text = "No measurement observes them. Their values come from the prior and are no results."

@@ -133,7 +133,7 @@ def _describe_depth(draft: Draft, files: Sequence[Path], videos: Sequence[Path],
             continue
         seen.append(video)
         is_used = alone and not colour and len(seen) == 1
-        why = f"{len(video)} depth images of {video.size[0]}x{video.size[1]} px"
+        why = f"{len(video)} depth image{'s' * (len(video) > 1)} of {video.size[0]}x{video.size[1]} px"
         entry = {"name": Value(path.stem), "file": Value(path, "likely", why)} | rate
         if video.camera is None:
             where = Path(draft.folder.name) / path.relative_to(draft.folder)
@@ -279,9 +279,12 @@ def _describe_markers(draft: Draft, files: Sequence[Path]) -> None:
         )
     moving = [path for path in records if not STATIC.search(path.name)]
     used = next(iter(moving or records), None) if not draft.cameras else None
+    still = next((path for path, record in records.items() if moving and used and path not in moving
+                  and {*record.names} & {*records[used].names}), None)  # fmt: skip
     for path, record in records.items():
         file = Value(path, "sure", f"{len(record.names)} markers, {len(record.positions)} frames, {record.rate:g} Hz")
-        draft.tables["markers"].append((path == used, {"file": file}))
+        trial = {"static": Value(still, "guess", "by its name, of the same person")} if path == used and still else {}
+        draft.tables["markers"] += [(path == used, {"file": file} | trial)] if path != still else []
         for text in record.notes:
             draft.note("markers", "open", text)
     if used is not None:
@@ -292,7 +295,9 @@ def _describe_markers(draft: Draft, files: Sequence[Path]) -> None:
         up = Value(record.up, "sure", "stated by the file") if record.up else up
         draft.head = {"rate": Value(record.rate, "sure", "of the markers"), "up": draft.note_value("up", up, "up")}
         draft.note("markers", "sure" if len(records) == 1 else "guess", f"{draft.name(used)}: used")
-    left = len(records) - (used is not None)
+        if still:
+            draft.note("markers", "guess", f"{draft.name(still)}: the static trial, for lengths and marker offsets")
+    left = len(records) - (used is not None) - (still is not None)
     if left:
         reason = "results of other programs, or" if draft.cameras else ""
         draft.note("markers", "guess", f"{left} files are comments: {reason} other recordings".replace("  ", " "))
