@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 import kinefit
-from benchmarks.faults_users_files import MM, scene, videos, write_depth
+from benchmarks.faults_users_files import scene, videos, write_depth
 from benchmarks.faults_users_pictures import QUIET, write_video
 from benchmarks.faults_users_pictures import run as command
 from benchmarks.figures import amount, data, figure
@@ -218,7 +218,8 @@ def _empty_ends(folder: Path) -> str:
     x = np.array(gait().positions[:140])
     x[:40] = x[100:] = np.nan
     write_markers(replace(gait(), positions=x, residual=None), folder / "walk.c3d")
-    outputs = [command("init", folder), command("track", folder, *FITTED), command("markers", "fit", folder / "walk.c3d")]
+    outputs = [command("init", folder), command("track", folder, *FITTED)]
+    outputs.append(command("markers", "fit", folder / "walk.c3d"))
     motions = [kinefit.read_motion(folder / name) for name in ("take-kinefit", "walk-kinefit")]
     right = all(len(m) == 60 and abs(m.times[0] - gait().first_time - 40 / m.rate) < 1e-6 for m in motions)
     right = right and all("first 40 and last 40" in text for _, text in outputs[1:])
@@ -324,19 +325,26 @@ def _one_camera(folder: Path) -> str:
 
 
 DOORS: dict[str, Answer] = {
-    "files: an archive": commands(_files("s.zip"), ("track", "@"), ("init", "@"), ("check", "@/s.zip"), words=("unpack",)),
+    "files: an archive": commands(
+        _files("s.zip"), ("track", "@"), ("init", "@"), ("check", "@/s.zip"), words=("unpack",)
+    ),
     "files: in the cloud": commands(
         _files(".IMG_1.MOV.icloud"), ("track", "@"), ("track", "@/.IMG_1.MOV.icloud"), words=("iCloud", "download")
     ),
-    "files: a download that is not finished": commands(_files("a.mp4.part"), ("track", "@"), words=("download", "again")),
+    "files: a download that is not finished": commands(
+        _files("a.mp4.part"), ("track", "@"), words=("download", "again")
+    ),
     "files: an address": commands(
         _nothing, ("track", "https://youtu.be/abc"), ("init", "https://drive.google.com/d/1"),
         ("export", "https://x.org/motion.npz", "--to", "bvh"), words=("address", "download"),
     ),
     "files: two videos for one": commands(
-        videos("a.mp4", "b.mp4"), ("track", "@/a.mp4", "@/b.mp4"), ("init", "@/a.mp4", "@/b.mp4"), words=("folder of its own",)
+        videos("a.mp4", "b.mp4"), ("track", "@/a.mp4", "@/b.mp4"), ("init", "@/a.mp4", "@/b.mp4"),
+        words=("folder of its own",),
     ),
-    "files: a video for a take": commands(videos("a.mp4"), ("track", "@/a.mp4"), ("check", "@/a.mp4"), words=("a video, not", "init")),
+    "files: a video for a take": commands(
+        videos("a.mp4"), ("track", "@/a.mp4"), ("check", "@/a.mp4"), words=("a video, not", "init")
+    ),
     "files: a video of one frame": commands(_one_frame, ("init", "@"), words=("one frame",)),
     "files: one photograph": commands(_photograph, ("init", "@"), ("track", "@"), words=("images such as me.jpg",)),
     "files: a 360° video of two fisheye images": commands(_files("VID.insv"), ("track", "@"), words=("360", "flat")),

@@ -13,9 +13,10 @@ from typing import Any
 from kinefit._files import read_npz
 from kinefit.batch.viewed import is_outdated
 from kinefit.errors import FileError, KinefitError, printable
-from kinefit.readers.depth.images import natural
+from kinefit.readers.depth.images import PICTURES, natural
 from kinefit.readers.guess.files import VIDEOS
 from kinefit.readers.take.file import read_take, takes_in
+from kinefit.readers.video import ENDINGS
 
 NEW = "new"
 UNFINISHED = "unfinished"
@@ -105,6 +106,15 @@ def video_files(folder: Path) -> list[Path]:
     """Video files directly in a folder, by name; empty if it cannot be read."""
     try:
         return sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS and path.is_file())
+    except OSError:
+        return []
+
+
+def openable_files(folder: Path) -> list[Path]:
+    """Files directly in a folder of which a take can be made, and takes, by name; empty if it cannot be read."""
+    kinds = {*VIDEOS, *ENDINGS, *PICTURES, ".c3d", ".trc", ".mcap", ".npy", ".toml"}
+    try:
+        return sorted(path for path in folder.iterdir() if path.suffix.lower() in kinds and path.is_file())
     except OSError:
         return []
 

@@ -71,9 +71,9 @@ def find_motion(path: str | PathLike[str]) -> Path:
     path = Path(path)
     inside = path / "motion.npz"
     if path.is_dir() and not inside.is_file():
-        below = [path.name for path in sorted(file.parent for file in path.glob("*/motion.npz"))]
-        named = f"Name a folder in it: {', '.join(below[:10])}." if below else "Give the folder that `kinefit track` wrote."
-        raise FileError("this folder has no motion.npz", file=path, remedy=named)
+        below = ", ".join(file.parent.name for file in sorted(path.glob("*/motion.npz"))[:10])
+        remedy = f"Name a folder in it: {below}." if below else "Give a folder that `kinefit track` wrote."
+        raise FileError("this folder has no motion.npz", file=path, remedy=remedy)
     return inside if inside.is_file() else path
 
 

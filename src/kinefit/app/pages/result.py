@@ -22,6 +22,7 @@ from kinefit.app.pages.shell import (
     page_frame,
     shell,
     show_error,
+    text_table,
     texts,
 )
 from kinefit.app.review import Review
@@ -31,11 +32,13 @@ from kinefit.batch.results import FORMATS, description, write_format
 from kinefit.batch.viewed import is_outdated
 from kinefit.errors import KinefitError
 from kinefit.exporters.report.moments import Moment, doubtful_moments
+from kinefit.exporters.tables import spoken
+from kinefit.initialization.from_clicks import clickable
 from kinefit.rendering.looks import to_hex
 
 _REFRESH_S = 0.1  # between two looks at the clock of the 3D figure
 _IMAGE_PX = 720  # longer side of a camera's image
-_IMAGES_REM = 25.0  # side of a square with as much area as all images have together
+_IMAGES_REM = 33.0  # side of a square with as much area as all images have together: four upright ones fill a row
 _MAX_POINTS = 2000  # of a curve
 
 
@@ -65,17 +68,32 @@ class _ResultPage:
             ui.label(t("result.other_cameras")).props('role="alert"')
         with ui.row().classes("w-full items-stretch"):
             page_frame(review.scene.address, "3D").classes("flex-1 min-w-[320px] min-h-[28rem] border")
-            with ui.row().classes("flex-1 min-w-[320px] content-start gap-1"):
+            wide = "flex-1" if len(review.cameras) < 2 else "flex-[2]"
+            with ui.row().classes(f"{wide} min-w-[320px] content-start gap-1"):
                 for camera in review.cameras:
                     image = ui.interactive_image(on_mouse=lambda event, camera=camera: self._click(camera, event))
                     image.props["alt"] = camera
                     self._images[camera] = image
                     self._enlarge(camera, False)
+                if review.cameras:
+                    with ui.row().classes("items-center w-full"):
+                        ui.label(t("result.drag")).classes("text-sm")
+                        names = list(dict.fromkeys((*clickable(motion.body), *motion.body.landmarks.names)))
+                        self._joint = ui.select(names, label=t("result.joint"), with_input=True, clearable=True)
+                        self._joint.classes("w-48")
         self._time_line()
+        with card(t("result.ranges")):
+            ui.label(t("result.ranges_text")).classes("text-sm")
+            columns = ("range_of", "left", "right", "middle", "difference")
+            text_table([t(f"result.{key}") for key in columns], review.ranges)
+            if (report := review.folder / "report.html").is_file():
+                desk.files.folders.add(review.folder)
+                ui.link(t("take.report"), link("/file", path=report), new_tab=True)
         with card(t("result.angle")):
-            names = motion.body.tree.coordinates
-            first = next((name for name in names if name.startswith("knee_angle")), names[0])
-            self._angle = ui.select(list(names), value=first, on_change=lambda: self._draw_angle())
+            names = {name: spoken(name) for name in motion.body.tree.coordinates}
+            first = next((name for name in names if name.startswith("knee_angle")), next(iter(names)))
+            self._angle = ui.select(names, value=first, with_input=True, on_change=lambda: self._draw_angle())
+            self._angle.classes("w-64")
             self._chart = ui.echart({}, on_point_click=lambda event: self._go(event.data_index * self._step))
             self._chart.classes("w-full h-56")
             self._draw_angle()
@@ -174,7 +192,7 @@ class _ResultPage:
             "xAxis": {"type": "category", "data": [round(float(s), 3) for s in motion.times[::step]], "name": "s"},
             "yAxis": {"type": "value", "scale": True, "name": self._t("result.angles_unit")},
             "series": [
-                {**line, "name": name, "data": _numbers(value), "markLine": _mark(0)},
+                {**line, "name": spoken(name), "data": _numbers(value), "markLine": _mark(0)},
                 {**band, "data": _numbers(value - spread)},
                 {**band, "data": _numbers(2 * spread), "areaStyle": {"opacity": 0.15}},
             ],
@@ -200,10 +218,6 @@ class _ResultPage:
             if cameras:
                 which = ui.select(cameras, value=cameras[0], label=t("result.which")).classes("w-32")
                 self._camera_buttons(which)
-        with ui.row().classes("items-center"):
-            ui.label(t("result.drag"))
-            names = list(self._review.motion.body.landmarks.names)
-            self._joint = ui.select(names, label=t("result.joint"), with_input=True, clearable=True).classes("w-48")
         self._list()
 
     def _camera_buttons(self, which: ui.select) -> None:

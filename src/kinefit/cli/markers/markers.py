@@ -182,7 +182,8 @@ Examples:
               "without a check.  [default: as labelled, checked]")
 @click.option("--limits/--no-limits", default=True, show_default=True, help="Keep joint angles within their limits.")
 @click.option("--smooth/--no-smooth", default=True, show_default=True, help="Fit all frames together, or each alone.")
-@click.option("--formats", metavar="LIST", help="Formats to write.  [default: all of motion,csv,bvh,glb,trc,mot,osim,markers,report]")
+@click.option("--formats", metavar="LIST",
+              help="Formats to write.  [default: motion,csv,bvh,glb,trc,mot,osim,markers,report]")  # fmt: skip
 @_unit
 @_screen.verbose_option
 def fit(

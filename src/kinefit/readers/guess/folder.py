@@ -83,8 +83,8 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
     videos = _describe_depth(draft, files, videos, alone=not (keypoints or markers or recordings))
     if not (videos or keypoints or markers or recordings or any(draft.tables.values())):
         if images := [path for path in files if path.suffix.lower() in (*ENDINGS, ".heic")]:
-            text = f"{len(images)} images such as {draft.name(images[0])}: a recording is a video, or 12 numbered images"
-            draft.note("files", "open", text)
+            such = f"{len(images)} images such as {draft.name(images[0])}"
+            draft.note("files", "open", f"{such}: a recording is a video, or 12 numbered images or more")
         said = "; ".join(note.text for note in draft.notes)
         raise TakeError(
             f"no videos, keypoints, markers, depth or recordings among {len(files)} files{said and f': {said}'}",
