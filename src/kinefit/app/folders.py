@@ -104,15 +104,15 @@ def is_result(folder: Path) -> bool:
 
 def video_files(folder: Path) -> list[Path]:
     """Video files directly in a folder, by name; empty if it cannot be read."""
-    try:
-        return sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS and path.is_file())
-    except OSError:
-        return []
+    return _files_of(folder, VIDEOS)
 
 
 def openable_files(folder: Path) -> list[Path]:
     """Files directly in a folder of which a take can be made, and takes, by name; empty if it cannot be read."""
-    kinds = {*VIDEOS, *ENDINGS, *PICTURES, ".c3d", ".trc", ".mcap", ".npy", ".toml"}
+    return _files_of(folder, {*VIDEOS, *ENDINGS, *PICTURES, ".c3d", ".trc", ".mcap", ".npy", ".toml"})
+
+
+def _files_of(folder: Path, kinds: set[str]) -> list[Path]:
     try:
         return sorted(path for path in folder.iterdir() if path.suffix.lower() in kinds and path.is_file())
     except OSError:

@@ -85,11 +85,15 @@ def print_files(files: Mapping[str, Path]) -> None:
 
 def lost_segments(motion: Motion) -> dict[str, NDArray]:
     """Segments that are lost, and in which frames somebody was tracked all the same; not those that bore no markers."""
-    gone = motion.lost & (motion.quality > 0)[:, None]
-    for name, frames in without_markers(motion).items():
-        gone[frames, motion.body.tree.segment(name)] = False
-    lost = {name: np.flatnonzero(gone[:, s]) for s, name in enumerate(motion.body.tree.segments)}
-    return {name: frames for name, frames in lost.items() if len(frames)}
+    from kinefit.exporters.report.moments import unmarked
+
+    return _frames_of(motion, motion.lost & (motion.quality > 0)[:, None] & ~unmarked(motion))
+
+
+def _frames_of(motion: Motion, gone: NDArray) -> dict[str, NDArray]:
+    """Segments -> frames in which flags (F, S) are set; without those that have none."""
+    frames = {name: np.flatnonzero(gone[:, s]) for s, name in enumerate(motion.body.tree.segments)}
+    return {name: at for name, at in frames.items() if len(at)}
 
 
 def _hands_together(motion: Motion, gone: Mapping[str, NDArray]) -> dict[str, NDArray]:
@@ -107,9 +111,7 @@ def without_markers(motion: Motion) -> dict[str, NDArray]:
     """Segments without markers, in frames of which none is seen: they hang on their neighbours."""
     from kinefit.exporters.report.moments import unmarked
 
-    bare = unmarked(motion)
-    found = {name: np.flatnonzero(bare[:, s]) for s, name in enumerate(motion.body.tree.segments)}
-    return {name: frames for name, frames in found.items() if len(frames)}
+    return _frames_of(motion, unmarked(motion))
 
 
 def bone_lengths(motion: Motion) -> dict[str, str]:

@@ -97,17 +97,13 @@ def write_first_take(folder: Path) -> Path:
     text = guess.text
     if sys.stdin.isatty() and "[calibration]" not in text:  # lengths then hang on the height alone
         asked = "Height of the person, in metres or centimetres; Enter where you do not know it"
-        height = click.prompt(asked, default="", show_default=False, value_proc=_known_height)
+        known = lambda answer: _screen.HEIGHT.convert(answer, None, None) if answer.strip() not in ("", "0") else 0.0
+        height = click.prompt(asked, default="", show_default=False, value_proc=known)
         text = text.replace(f"# {OPEN_HEIGHT}", f"height = {height:g}") if height else text
     write_text(out, text)
     show(guess.notes)
     _screen.say(f"{out}: written. Later runs of track use it.")
     return out
-
-
-def _known_height(answer: str) -> float:
-    """A stature [m]; 0 of an empty answer."""
-    return 0.0 if answer.strip() in ("", "0") else _screen.HEIGHT.convert(answer, None, None)
 
 
 def show(notes: tuple) -> None:

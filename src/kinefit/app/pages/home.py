@@ -12,19 +12,8 @@ from kinefit._files import writing
 from kinefit.app.desk import Desk
 from kinefit.app.folders import SessionRow, openable_files, recordings, subfolders, takes_below
 from kinefit.app.jobs import DONE, RUNNING
-from kinefit.app.pages.shell import (
-    card,
-    in_thread,
-    link,
-    loaded,
-    notified,
-    page_frame,
-    shell,
-    short,
-    show_error,
-    text_table,
-    texts,
-)
+from kinefit.app.pages.result import text_table
+from kinefit.app.pages.shell import card, in_thread, link, loaded, notified, page_frame, shell, short, show_error, texts
 from kinefit.app.pages.take import use_folder
 from kinefit.app.review import Comparison
 from kinefit.app.texts import Texts

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,6 @@ from kinefit.app.pages.shell import (
     page_frame,
     shell,
     show_error,
-    text_table,
     texts,
 )
 from kinefit.app.review import Review
@@ -38,7 +37,7 @@ from kinefit.rendering.looks import to_hex
 
 _REFRESH_S = 0.1  # between two looks at the clock of the 3D figure
 _IMAGE_PX = 720  # longer side of a camera's image
-_IMAGES_REM = 33.0  # side of a square with as much area as all images have together: four upright ones fill a row
+_IMAGE_REM, _IMAGES_A_ROW = 24.0, 4  # largest height of an image, and number of them side by side
 _MAX_POINTS = 2000  # of a curve
 
 
@@ -66,10 +65,11 @@ class _ResultPage:
         motion = review.motion
         if not review.has_cameras:
             ui.label(t("result.other_cameras")).props('role="alert"')
+        self._time_line()
         with ui.row().classes("w-full items-stretch"):
-            page_frame(review.scene.address, "3D").classes("flex-1 min-w-[320px] min-h-[28rem] border")
-            wide = "flex-1" if len(review.cameras) < 2 else "flex-[2]"
-            with ui.row().classes(f"{wide} min-w-[320px] content-start gap-1"):
+            page_frame(review.scene.address, "3D").classes("flex-1 min-w-[320px] min-h-[26rem] border")
+            wide = "flex-1 min-w-[320px]" if len(review.cameras) < 2 else "w-full"
+            with ui.row().classes(f"{wide} content-start gap-1"):
                 for camera in review.cameras:
                     image = ui.interactive_image(on_mouse=lambda event, camera=camera: self._click(camera, event))
                     image.props["alt"] = camera
@@ -81,7 +81,6 @@ class _ResultPage:
                         names = list(dict.fromkeys((*clickable(motion.body), *motion.body.landmarks.names)))
                         self._joint = ui.select(names, label=t("result.joint"), with_input=True, clearable=True)
                         self._joint.classes("w-48")
-        self._time_line()
         with card(t("result.ranges")):
             ui.label(t("result.ranges_text")).classes("text-sm")
             columns = ("range_of", "left", "right", "middle", "difference")
@@ -107,8 +106,9 @@ class _ResultPage:
     def _enlarge(self, camera: str, large: bool) -> None:
         """Show a camera's image as wide as there is room, or as small as all of them fit."""
         width, height = self._review.size(camera)
-        side = _IMAGES_REM * (width / height / len(self._review.cameras)) ** 0.5
-        self._images[camera].style(f"width: {'100%' if large else f'min(100%, {side:.1f}rem)'}")
+        share = 100.0 / min(len(self._review.cameras), _IMAGES_A_ROW)
+        small = f"min({share:.4g}% - 0.25rem, {_IMAGE_REM * width / height:.1f}rem)"
+        self._images[camera].style(f"width: {'100%' if large else small}")
         self._large = camera if large else None
 
     def _time_line(self) -> None:
@@ -313,6 +313,14 @@ class _ResultPage:
             for format in FORMATS.names():
                 button = ui.button(format, on_click=lambda format=format: write(format)).props("outline no-caps")
                 button.tooltip(description(format))
+
+
+def text_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """A table of texts, whose first column has the names of its rows."""
+    heads = [{"name": str(k), "label": head, "field": str(k), "align": "right" if k else "left"}
+             for k, head in enumerate(columns)]  # fmt: skip
+    cells = [{str(k): text.replace(" ", "\u00a0") if k else text for k, text in enumerate(row)} for row in rows]
+    ui.table(columns=heads, rows=cells, row_key="0").classes("w-full").props("dense wrap-cells")
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:

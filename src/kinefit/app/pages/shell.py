@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -77,14 +77,6 @@ def card(title: str) -> ui.card:
     with made:
         ui.label(title).classes("text-lg font-medium").props('role="heading" aria-level="2"')
     return made
-
-
-def text_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """A table of texts, whose first column has the names of its rows."""
-    heads = [{"name": str(k), "label": head, "field": str(k), "align": "right" if k else "left"}
-             for k, head in enumerate(columns)]  # fmt: skip
-    cells = [{str(k): text.replace(" ", "\u00a0") if k else text for k, text in enumerate(row)} for row in rows]
-    ui.table(columns=heads, rows=cells, row_key="0").classes("w-full").props("dense wrap-cells")
 
 
 def show_error(t: Texts, error: KinefitError | dict[str, str]) -> None:

@@ -254,13 +254,11 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         frames = take.frames or _span(dense or recordings or clicks, rate)
     else:
         first_time = float(min(times[0] for _, times in marked))
-        spans = [times[[m.seen_frames[0], m.seen_frames[1] - 1]] for (_, times), m in zip(marked, markers)]
-        begin = min(start for start, _ in spans)
-        end = max(last + 1.0 / m.rate for (_, last), m in zip(spans, markers))
-        frames, marked = (round((begin - first_time) * rate), round((end - first_time) * rate)), []
-        if take.frames is None:
-            notes += [note for m in markers for note in m.trimmed().notes[len(m.notes) :]]
-        frames = take.frames or frames
+        shown = [m.trimmed() for m in markers]
+        starts = [e.time_offset + m.first_time for e, m in zip(take.markers, shown)]
+        seen = min(starts), max(start + len(m) / m.rate for start, m in zip(starts, shown))
+        notes += [note for m, all_of in zip(shown, markers) for note in m.notes[len(all_of.notes) :] if not take.frames]
+        frames, marked = take.frames or (round((seen[0] - first_time) * rate), round((seen[1] - first_time) * rate)), []
     kinds = {LineVideo: "lines of camera ", KeypointVideo: "keypoints of camera ", DepthVideo: "depth ",
              CloudVideo: "depth "}  # fmt: skip
     others = [(f"{kinds.get(type(r), '')}{r.sensor}", r.times) for r in (*recordings, *skin)]
