@@ -79,8 +79,9 @@ def choose_person(take: TakePath, person: int | str | None) -> None:
 
 
 def set_height(take: TakePath, height: float | str | None) -> None:
-    """State the person's height [m], also as `stature_of` reads it: "175 cm"; None or "": it is not stated."""
-    write_edits(take, [Edit("take", "height", None if height in (None, "") else f"{stature_of(height)!r}")])
+    """State the person's height [m], or a text that `stature_of` reads: "175 cm"; None or "": it is not stated."""
+    metres = stature_of(height) if isinstance(height, str) and height else height
+    write_edits(take, [Edit("take", "height", f"{float(metres)!r}" if metres else None)])
 
 
 def can_undo(take: TakePath) -> bool:

@@ -125,7 +125,8 @@ def _describe_depth(draft: Draft, files: Sequence[Path], videos: Sequence[Path],
     colour, seen = [path for path in videos if path not in found], list[DepthVideo]()
     for path in single:
         draft.note("depth", "open", f"{draft.name(path)}: one depth image, not a recording: one pose, without motion")
-    for path in [*found, *single]:
+    pictures = [path for path in single if path.suffix != ".npy"]  # which may be any table
+    for path in found or (pictures[:1] if alone and not colour else []):
         try:
             video, rate = _depth_of(path)
         except KinefitError as error:
