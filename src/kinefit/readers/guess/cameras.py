@@ -94,9 +94,8 @@ def describe_uncalibrated(draft: Draft, videos: Mapping[str, Path]) -> None:
             if len(video) == 1:
                 draft.note("video", "open", f"{draft.name(video.path)}: one frame: one pose, without motion")
             if video.size[0] == 2 * video.size[1]:
-                alike = "export a flat view of it. A telephone of 18:9 looks the same"
-                text = f"{draft.name(video.path)}: twice as wide as high, as 360° videos are: {alike}"
-                draft.note("video", "open", text)
+                text = "twice as wide as high, as 360° videos: export a flat view; telephones of 18:9 look the same"
+                draft.note("video", "open", f"{draft.name(video.path)}: {text}")
     more = "10 % wider places people 10 % nearer" if len(opened) == 1 else "kinefit track estimates it with the poses"
     why = f"degrees across the longer side; {DEFAULT_FIELD_OF_VIEW:g} is typical of telephones; {more}"
     offsets = _time_codes(draft, opened)

@@ -137,8 +137,7 @@ def _describe_depth(draft: Draft, files: Sequence[Path], videos: Sequence[Path],
         why = f"{len(video)} depth image{'s' * (len(video) > 1)} of {video.size[0]}x{video.size[1]} px"
         entry = {"name": Value(path.stem), "file": Value(path, "likely", why)} | rate
         if video.camera is None:
-            where = Path(draft.folder.name) / path.relative_to(draft.folder)
-            entry["intrinsics"] = guessed_intrinsics(where, video.size)
+            entry["intrinsics"] = guessed_intrinsics(Path(draft.folder.name) / draft.name(path), video.size)
             if is_used:
                 draft.note_value("intrinsics", entry["intrinsics"], "intrinsics")
         draft.tables["depth"].append((is_used, entry))
