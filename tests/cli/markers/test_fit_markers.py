@@ -130,7 +130,8 @@ def test_parts_without_markers_are_not_observed_and_not_doubtful(tmp_path):
     assert "not observed, as they have no markers: abdomen, thorax, head" in told
     assert "doubtful moments: none" in told and "lost" not in told
     page = (tmp_path / "legs-kinefit" / "report.html").read_text()
-    assert "Not observed: abdomen, thorax, head" in page and "None: no end of a segment" in page
+    assert "Not observed, as they have no markers: abdomen, thorax" in page and "None: no end of a segment" in page
+    assert 'class="callout bad"' not in page
 
 
 def test_a_take_names_a_static_trial(tmp_path):

@@ -197,7 +197,7 @@ def _summary(
 
 def _trust(motion: Motion, moments: Sequence[Moment]) -> tuple[str, str]:
     """How far the motion can be trusted: severity of a box, and the sentence."""
-    poor = float(np.mean(motion.quality < POORLY_SUPPORTED))
+    poor = float(np.mean(motion.quality < POORLY_SUPPORTED * (1.0 - unmarked(motion).mean(axis=1))))
     unobserved = float(np.mean(motion.quality <= 0))
     wrong = unobserved > 0.1 or poor > 0.5 or of_provenance(motion.provenance)
     throughout = throughout_sentence(motion)
@@ -261,13 +261,13 @@ def _limits(motion: Motion) -> list[p.Html]:
     if throughout := throughout_sentence(motion):
         parts.append(p.callout("note", f"Uncertain in most frames, at the far end (2 σ): {throughout}."))
     bare = np.flatnonzero(2 * unmarked(motion).sum(axis=0) > len(motion))
+    text = "No measurement observes them. Their values come from the prior and are no results."
     if len(bare):
         names = spoken_segments(motion.body, [motion.body.tree.segments[s] for s in bare], 20)
-        text = "They have no markers: their pose follows their neighbours and the posture prior, and is no result."
-        parts.append(p.callout("note", f"Not observed: {names}.", text))
-    blind = never_observed(motion)
+        parts.append(p.callout("note", f"Not observed, as they have no markers: {names}.", text))
+    angles_of_bare = {motion.body.tree.coordinates[d] for d in np.flatnonzero(np.isin(motion.body.tree.owners, bare))}
+    blind = [name for name in never_observed(motion) if name not in angles_of_bare]
     if blind:
-        text = "No measurement observes them. Their values come from the prior and are no results."
         most = len(blind) > 0.5 * len(motion.body.dof_names)
         title = f"Not observed: {listed([spoken(name) for name in blind], 8)}."
         parts.append(p.callout("bad" if most else "note", title, text))
