@@ -288,7 +288,7 @@ def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMark
             own, known, std = _set_of(body, markers.names, entry.set)
         if own and own not in body.marker_sets:
             body = replace(body, marker_sets={**body.marker_sets, own: known})
-        named, trial = (one and _named_as(one, known.names) for one in (markers, trial))
+        named, trial = _named_as(markers, known.names), trial and _named_as(trial, known.names)
         out.append(NamedMarkers(sensor_name("markers", take.markers, k), named, own, entry.time_offset, std, trial))
     return out, body
 

@@ -213,7 +213,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     images = {entry.name: image_frame(entry, rig, sizes.get(entry.name), take) for entry in take.cameras}
     of_cameras = TakeCameras(take, rig, images, clocks, rates, streams, sizes)
     keypoints, markers = [], tuple(_read_markers(entry, entry.file) for entry in take.markers)
-    static_markers = tuple(entry.static and _read_markers(entry, entry.static) for entry in take.markers)
+    static_markers = tuple(_read_markers(e, e.static) if e.static else None for e in take.markers)
     for number, source in enumerate(take.keypoints):
         read, times = _read_keypoints(source, of_cameras, number)
         stream = f"keypoints {source.camera}" + f" ({source.format})" * (len(take.keypoints) > len(take.cameras))
