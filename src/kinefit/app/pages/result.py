@@ -78,8 +78,8 @@ class _ResultPage:
                 if review.cameras:
                     with ui.row().classes("items-center w-full"):
                         ui.label(t("result.drag")).classes("text-sm")
-                        names = list(dict.fromkeys((*clickable(motion.body), *motion.body.landmarks.names)))
-                        self._joint = ui.select(names, label=t("result.joint"), with_input=True, clearable=True)
+                        joints = list(dict.fromkeys((*clickable(motion.body), *motion.body.landmarks.names)))
+                        self._joint = ui.select(joints, label=t("result.joint"), with_input=True, clearable=True)
                         self._joint.classes("w-48")
         with card(t("result.ranges")):
             ui.label(t("result.ranges_text")).classes("text-sm")
