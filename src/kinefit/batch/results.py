@@ -113,6 +113,7 @@ DEFAULT_FORMATS = ("motion", "csv", "bvh", "glb", "trc", "mot", "osim")
 
 _OTHER_RESULTS = {
     "overlays": "videos with the fitted skeleton",
+    "markers": "markers as measured, for OpenSim beside body.osim",
     "montage": "one image of all cameras",
     "report": "results with error bars and findings, as a page for the browser",
 }

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from kinefit import __version__
+from kinefit._files import stature_of
 from kinefit.batch.results import Step
 from kinefit.errors import ExportError, KinefitError, choices
 from kinefit.readers.plugins import install
@@ -29,8 +30,31 @@ if TYPE_CHECKING:
 
     from kinefit.findings import Finding
 
-PATH = click.Path(path_type=Path)
-"""Type of arguments and options that are files or folders."""
+class _Path(click.Path):
+    """A file or folder of this computer."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path; an address of the network is refused."""
+        if isinstance(value, str) and "://" in value:
+            self.fail(f"{value!r} is an address, not a file or folder here. Download it, and name what you saved.")
+        return super().convert(value, param, ctx)
+
+
+class _Height(click.ParamType):
+    """A stature, as people write it."""
+
+    name = "height"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """[m]."""
+        try:
+            return stature_of(value)
+        except KinefitError as error:
+            self.fail(str(error), param, ctx)
+
+
+PATH, HEIGHT = _Path(path_type=Path), _Height()
+"""Types of arguments and options that are files or folders; that are statures, in metres or centimetres."""
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""

@@ -471,3 +471,16 @@ def test_lengths_are_in_centimetres_with_deviations_where_known():
     assert f"<td>{length:.1f}</td>" in lengths_table(motion)
     told = replace(motion, provenance={"length_std_m": {"thigh_l-shank_l": 0.012}})
     assert f"<td>{length:.1f} ± 1.2</td>" in lengths_table(told)
+
+
+def test_one_camera_is_one_sensor_and_nothing_uncertain_is_in_order(tmp_path):
+    motion = good_motion(offsets=((0.0, 0.0),))
+    seen = motion.residuals["cam0"]
+    x = np.zeros((F, len(seen.names), 3))
+    lifted = replace(seen, unit="m", values=x, measured=x + 1.0)
+    both = replace(motion, residuals={"cam0": seen, "lifted cam0": lifted})
+    page = write_report(both, tmp_path / "a.html").read_text()
+    assert "<dt>Sensors</dt><dd>1</dd>" in page and "Markers of" not in page and 'class="callout good"' in page
+    wide = replace(both, joint_std=np.full_like(motion.joint_std, 0.365))
+    page = write_report(wide, tmp_path / "b.html").read_text()
+    assert "the whole body (±" in page and 'class="callout good"' not in page

@@ -335,6 +335,12 @@ class AngleRange:
         """Whether the angle moved by more than the error bar on any side."""
         return any(span > twice for span, twice in self.sides.values())
 
+    @property
+    def row(self) -> tuple[str, ...]:
+        """Its name, and the ranges of left, right and middle and left minus right in words, "" where there is none."""
+        each = (*map(self.sides.get, ("left", "right", "")), self.difference)
+        return self.name[0].upper() + self.name[1:], *(with_error(*pair) if pair else "" for pair in each)
+
 
 def all_ranges(motion: Motion) -> list[AngleRange]:
     """Ranges of all angles that were observed."""
@@ -348,13 +354,8 @@ def all_ranges(motion: Motion) -> list[AngleRange]:
 
 def short_table(found: Sequence[AngleRange]) -> p.Html:
     """Ranges, left beside right, and their difference."""
-    cells = [
-        [with_error(*pair) if pair else "" for pair in (*map(one.sides.get, ("left", "right", "")), one.difference)]
-        for one in found
-    ]
-    names = [one.name[0].upper() + one.name[1:] for one in found]
     columns = ["range of motion [°]", "left", "right", "middle", "left minus right"]
-    return p.table(columns, [(name, *row) for name, row in zip(names, cells)])
+    return p.table(columns, [one.row for one in found])
 
 
 def _difference(motion: Motion, left: Extremes | None, right: Extremes | None) -> tuple[float, float] | None:

@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 
 from kinefit.exporters.pictures.drawing import draw_body, draw_residuals, drawn_points
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.moments import Moment, doubtful_moments, place, span, spoken_segments
+from kinefit.exporters.report.moments import (
+    Moment,
+    doubtful_moments,
+    place,
+    span,
+    spoken_segments,
+    throughout_sentence,
+)
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
 
@@ -28,8 +35,10 @@ def flagged(motion: Motion, moments: Sequence[Moment], pictures: Pictures, width
     if not motion.residuals and not moments:
         return [p.callout("note", "This motion has no measurements, so doubtful moments are not known.")]
     if not moments:
-        text = "None: no end of a segment is probably more than 5 cm off, except where it is so in most frames."
-        return [p.callout("good", text)]
+        text, throughout = "None: no end of a segment is probably more than 5 cm off", throughout_sentence(motion)
+        if throughout:
+            return [p.callout("note", f"{text} for a moment only. In most frames these are: {throughout}.")]
+        return [p.callout("good", f"{text}.")]
     out = [time_line(motion, moments)]
     for m in moments[:MOMENTS]:
         shots = [

@@ -50,9 +50,21 @@ def uncertain_throughout(motion: Motion) -> dict[str, float]:
     """Segments with an end that is rather more than 5 cm off in most frames, and its median sigma [m]."""
     if not motion.residuals or not len(motion):
         return {}
-    often = np.median(probably_far(motion), axis=0) > _DOUBTFUL
+    often, bare = np.median(probably_far(motion), axis=0) > _DOUBTFUL, 2 * unmarked(motion).sum(axis=0) > len(motion)
     sigma = np.median(end_sigmas(motion), axis=0)
-    return {name: float(sigma[s]) for s, name in enumerate(motion.body.tree.segments) if often[s]}
+    return {name: float(sigma[s]) for s, name in enumerate(motion.body.tree.segments) if often[s] and not bare[s]}
+
+
+def unmarked(motion: Motion) -> NDArray:
+    """(F, S) bool: segments that are not observed, as no marker on them is seen and no other sensor looked."""
+    bare = motion.lost & (motion.quality > 0)[:, None]
+    markers = [r for r in motion.residuals.values() if r.of_points and r.unit == "m"]
+    if not markers or len(markers) < len(motion.residuals):
+        return np.zeros_like(bare)
+    for r in markers:
+        for s in np.unique(r.segments):
+            bare[:, s] &= ~np.isfinite(r.norms[:, r.segments == s]).any(axis=1)
+    return bare
 
 
 def end_sigmas(motion: Motion) -> NDArray:
@@ -249,9 +261,9 @@ def plain(segment: str) -> str:
     return f"{side} {f'{DIGITS[digit].lower()} ({bone})' if bone and digit in DIGITS else name}".strip()
 
 
-def spoken_segments(body: Body, segments: Sequence[str]) -> str:
+def spoken_segments(body: Body, segments: Sequence[str], most: int = 4) -> str:
     """Segments in words, each once; several fingers of a hand together: "fingers of the left hand"."""
-    return listed(dict.fromkeys(_spoken(body, segments).values()) or ["whole body"], 4)
+    return listed(dict.fromkeys(_spoken(body, segments).values()) or ["whole body"], most)
 
 
 def _spoken(body: Body, segments: Sequence[str]) -> dict[str, str]:
@@ -274,7 +286,7 @@ def _doubts(motion: Motion) -> Iterable[_Doubt]:
         return
     share = 1 / len(motion.body.tree.segments)
     sigma, against = end_sigmas(motion), contradicted(motion)
-    flags = doubtful(probably_far(motion), against) & (motion.quality > 0)[:, None]
+    flags = doubtful(probably_far(motion), against) & (motion.quality > 0)[:, None] & ~unmarked(motion)
     unbounded = ~np.isfinite(motion.joint_std).all(axis=-1)
     often = 2 * flags.sum(axis=0) > len(motion)
     flags &= ~often | against | (sigma > 2 * np.median(sigma, axis=0))

@@ -41,7 +41,9 @@ from kinefit.exporters.report.moments import (
     doubtful_moments,
     never_observed,
     shared_by_prior,
+    spoken_segments,
     throughout_sentence,
+    unmarked,
 )
 from kinefit.exporters.tables import curves, spoken
 from kinefit.findings import listed, of_provenance
@@ -195,11 +197,14 @@ def _summary(
 
 def _trust(motion: Motion, moments: Sequence[Moment]) -> tuple[str, str]:
     """How far the motion can be trusted: severity of a box, and the sentence."""
-    poor = float(np.mean(motion.quality < POORLY_SUPPORTED))
+    poor = float(np.mean(motion.quality < POORLY_SUPPORTED * (1.0 - unmarked(motion).mean(axis=1))))
     unobserved = float(np.mean(motion.quality <= 0))
     wrong = unobserved > 0.1 or poor > 0.5 or of_provenance(motion.provenance)
-    severity = "bad" if wrong else "warning" if moments else "good"
+    throughout = throughout_sentence(motion)
+    severity = "bad" if wrong else "warning" if moments or throughout else "good"
     parts = [trust_sentence(motion, moments)]
+    if throughout:
+        parts.append(f" Uncertain in most frames, at the far end (2 σ): {throughout}.")
     if moments:
         parts += [" See ", p.link("doubtful-moments", "where and why"), "."]
     if unobserved:
@@ -255,9 +260,14 @@ def _limits(motion: Motion) -> list[p.Html]:
         parts.append(p.callout("warning", f"Constant shift in {shifts}.", text))
     if throughout := throughout_sentence(motion):
         parts.append(p.callout("note", f"Uncertain in most frames, at the far end (2 σ): {throughout}."))
-    blind = never_observed(motion)
+    bare = np.flatnonzero(2 * unmarked(motion).sum(axis=0) > len(motion))
+    text = "No measurement observes them. Their values come from the prior and are no results."
+    if len(bare):
+        names = spoken_segments(motion.body, [motion.body.tree.segments[s] for s in bare], 20)
+        parts.append(p.callout("note", f"Not observed, as they have no markers: {names}.", text))
+    angles_of_bare = {motion.body.tree.coordinates[d] for d in np.flatnonzero(np.isin(motion.body.tree.owners, bare))}
+    blind = [name for name in never_observed(motion) if name not in angles_of_bare]
     if blind:
-        text = "No measurement observes them. Their values come from the prior and are no results."
         most = len(blind) > 0.5 * len(motion.body.dof_names)
         title = f"Not observed: {listed([spoken(name) for name in blind], 8)}."
         parts.append(p.callout("bad" if most else "note", title, text))
