@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from kinefit import __version__
-from kinefit._files import stature_of
 from kinefit.batch.results import Step
 from kinefit.errors import ExportError, KinefitError, choices
 from kinefit.readers.plugins import install
@@ -47,6 +46,8 @@ class _Height(click.ParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """[m]."""
+        from kinefit._files import stature_of
+
         try:
             return stature_of(value)
         except KinefitError as error:
