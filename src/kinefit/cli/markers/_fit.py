@@ -316,8 +316,8 @@ def fit_file(
             files["markers"] = own / _MARKERS
         if "report" in formats:
             links = {file.relative_to(own).as_posix(): description(name) for name, file in files.items()}
-            told = [("warning", f"{text}.", "") for text in left_out]
-            files["report"] = write_report(motion, own / "report.html", files=links, findings=told)
+            trimmed = [("warning", f"{text}.", "") for text in left_out]
+            files["report"] = write_report(motion, own / "report.html", files=links, findings=trimmed)
         found[person] = motion, files
     return found
 
