@@ -30,7 +30,7 @@ from benchmarks.smoothing import acceleration_noise, peak_speeds
 from kinefit import Motion, track_take
 from kinefit.bodies import PointSet
 from kinefit.evaluation import angle_errors
-from kinefit.exporters.report.moments import DOUBT_DISTANCE_M, contradicted, probably_far
+from kinefit.exporters.report.moments import DOUBT_DISTANCE_M, contradicted, end_variances, probably_far
 
 MIXES: dict[str, tuple[str, ...]] = {
     "cameras": ("keypoints",),
@@ -101,7 +101,8 @@ def compare(truth: Motion, motion: Motion, seen: tuple[NDArray, NDArray], second
         acceleration_noise(shift, truth.rate), float(np.median(peak_speeds(motion) / peak_speeds(truth))), *seen,
         seconds,
         np.array([
-            error_of_ends(truth, motion) > DOUBT_DISTANCE_M, probably_far(motion), contradicted(motion), motion.lost,
+            error_of_ends(truth, motion) > DOUBT_DISTANCE_M, probably_far(end_variances(motion)),
+            contradicted(motion), motion.lost,
         ]),
     )  # fmt: skip
 

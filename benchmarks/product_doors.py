@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 import kinefit
-from benchmarks.faults_users_files import scene, videos, write_depth
+from benchmarks.faults_users_files import named_files, scene, videos, write_depth
 from benchmarks.faults_users_pictures import QUIET, write_video
 from benchmarks.faults_users_pictures import run as command
 from benchmarks.figures import amount, data, figure
@@ -63,7 +63,7 @@ def _state(name: str, answer: Answer) -> str:
     return state
 
 
-def told(*words: str, right: bool = False, status: int | None = None, printed: str = "") -> str:
+def verdict(*words: str, right: bool = False, status: int | None = None, printed: str = "") -> str:
     """Right where it is; said where all words were printed; unsaid else, and after a warning of Python's own."""
     text = printed.lower()
     if _OF_PYTHON.search(printed) or status == 1:
@@ -79,7 +79,7 @@ def commands(make: Callable[[Path], object], *lines: tuple[str, ...], words: tup
         states = []
         for line in lines:
             status, printed = command(*(word.replace("@", str(folder)) for word in line))
-            states.append(told(*words, status=status, printed=printed))
+            states.append(verdict(*words, status=status, printed=printed))
         return "unsaid" if "unsaid" in states else "said"
 
     return answer
@@ -90,14 +90,6 @@ def commands(make: Callable[[Path], object], *lines: tuple[str, ...], words: tup
 
 def _nothing(_: Path) -> None:
     """An empty folder."""
-
-
-def _files(*names: str) -> Callable[[Path], None]:
-    def make(folder: Path) -> None:
-        for name in names:
-            (folder / name).write_bytes(b"PK\x03\x04")
-
-    return make
 
 
 def _photograph(folder: Path) -> None:
@@ -148,7 +140,7 @@ def _depth_alone(count: int) -> Answer:
         motion = kinefit.read_motion(folder / "take-kinefit") if not outputs[-1][0] else None
         right = motion is not None and len(motion) == count and motion.quality.max() > 0.25
         printed = " ".join(text for _, text in outputs)
-        return told(right=right and not any(status for status, _ in outputs), printed=printed)
+        return verdict(right=right and not any(status for status, _ in outputs), printed=printed)
 
     return answer
 
@@ -164,7 +156,7 @@ def _preset(name: str, size: tuple[int, int], focal: float | None, *words: str) 
         status, printed = command("init", folder)
         found = _written(folder).get("intrinsics")
         right = focal is not None and found == [focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2]
-        return told(*words, right=right, status=status, printed=printed)
+        return verdict(*words, right=right, status=status, printed=printed)
 
     return answer
 
@@ -210,7 +202,7 @@ def _markers_alone(folder: Path) -> str:
     agree = np.degrees(np.abs(a.angles[:, angle] - b.angles[:, angle])).max() < 1.0
     told_all = {"report.html", "tables", "motion.npz"} <= {path.name for path in (folder / "walk-kinefit").iterdir()}
     right = agree and told_all and "needs cameras" not in printed and not any(status for status, _ in outputs)
-    return told(right=right, printed=printed)
+    return verdict(right=right, printed=printed)
 
 
 def _empty_ends(folder: Path) -> str:
@@ -223,7 +215,7 @@ def _empty_ends(folder: Path) -> str:
     motions = [kinefit.read_motion(folder / name) for name in ("take-kinefit", "walk-kinefit")]
     right = all(len(m) == 60 and abs(m.times[0] - gait().first_time - 40 / m.rate) < 1e-6 for m in motions)
     right = right and all("first 40 and last 40" in text for _, text in outputs[1:])
-    return told(right=right, printed=" ".join(text for _, text in outputs))
+    return verdict(right=right, printed=" ".join(text for _, text in outputs))
 
 
 def _legs_alone(folder: Path) -> str:
@@ -233,7 +225,7 @@ def _legs_alone(folder: Path) -> str:
     page = (folder / "walk-kinefit" / "report.html").read_text()
     right = "doubtful moments: none" in printed and "not observed, as they have no markers: abdomen" in printed
     right = right and "Not observed, as they have no markers: abdomen" in page and 'class="callout bad"' not in page
-    return told(right=right, status=status, printed=printed)
+    return verdict(right=right, status=status, printed=printed)
 
 
 def _static_trial(folder: Path) -> str:
@@ -247,7 +239,7 @@ def _static_trial(folder: Path) -> str:
     bodies = [kinefit.read_motion(folder / name).body for name in ("take-kinefit", "walk-kinefit")]
     lengths = [np.linalg.norm(body.tree.offsets, axis=1) for body in bodies]
     right = 'static = "static.trc"' in (folder / "take.toml").read_text() and np.allclose(*lengths, atol=2e-3)
-    return told(right=right, printed=" ".join(text for _, text in outputs))
+    return verdict(right=right, printed=" ".join(text for _, text in outputs))
 
 
 def _without_unit(folder: Path) -> str:
@@ -260,7 +252,7 @@ def _without_unit(folder: Path) -> str:
     status, printed = command("markers", "fit", file, "--formats", "motion")
     motion = None if status else kinefit.read_motion(folder / "walk-kinefit")
     right = motion is not None and motion.body.stature is not None and 1.5 < motion.body.stature < 2.1
-    return told("states no unit", right=right, status=status, printed=printed)
+    return verdict("states no unit", right=right, status=status, printed=printed)
 
 
 # ---- a stature in centimetres, in each field
@@ -273,7 +265,7 @@ def _tall(folder: Path) -> str:
     for k, height in enumerate(("1.75", "175", "1,75", "175 cm")):
         command("markers", "fit", folder / "walk.trc", "--height", height, "--formats", "motion", "-o", folder / str(k))
         tall.append(kinefit.read_motion(folder / str(k)).body.stature)
-    return told(right=np.ptp(tall) < 1e-9)
+    return verdict(right=np.ptp(tall) < 1e-9)
 
 
 def _window_height(folder: Path) -> str:
@@ -284,7 +276,7 @@ def _window_height(folder: Path) -> str:
     for height in ("1.75", "175", "1,75", "1,75 m"):
         corrections.set_height(file, height)
         found.append(kinefit.read_take(file).height)
-    return told(right=set(found) == {1.75})
+    return verdict(right=set(found) == {1.75})
 
 
 # ---- results
@@ -304,7 +296,7 @@ def _export_folder(folder: Path) -> str:
     status, _ = command("export", folder / "take-kinefit", "--to", "bvh")
     right = status == 0 and (folder / "take-kinefit" / "motion.bvh").is_file()
     other = command("export", folder, "--to", "bvh")[1]
-    return told(right=right and "take-kinefit" in other)
+    return verdict(right=right and "take-kinefit" in other)
 
 
 def _one_camera(folder: Path) -> str:
@@ -322,18 +314,18 @@ def _one_camera(folder: Path) -> str:
     page = write_report(wide, folder / "report.html").read_text()
     facts = page[page.index("<dt>Sensors</dt>") :][:40]
     right = "<dd>1</dd>" in facts and 'class="callout good"' not in page and "whole body (±" in page
-    return told(right=right)
+    return verdict(right=right)
 
 
 DOORS: dict[str, Answer] = {
     "files: an archive": commands(
-        _files("s.zip"), ("track", "@"), ("init", "@"), ("check", "@/s.zip"), words=("unpack",)
+        named_files("s.zip"), ("track", "@"), ("init", "@"), ("check", "@/s.zip"), words=("unpack",)
     ),
     "files: in the cloud": commands(
-        _files(".IMG_1.MOV.icloud"), ("track", "@"), ("track", "@/.IMG_1.MOV.icloud"), words=("iCloud", "download")
+        named_files(".IMG_1.MOV.icloud"), ("track", "@"), ("track", "@/.IMG_1.MOV.icloud"), words=("iCloud", "download")
     ),
     "files: a download that is not finished": commands(
-        _files("a.mp4.part"), ("track", "@"), words=("download", "again")
+        named_files("a.mp4.part"), ("track", "@"), words=("download", "again")
     ),
     "files: an address": commands(
         _nothing, ("track", "https://youtu.be/abc"), ("init", "https://drive.google.com/d/1"),
@@ -348,7 +340,9 @@ DOORS: dict[str, Answer] = {
     ),
     "files: a video of one frame": commands(_one_frame, ("init", "@"), words=("one frame",)),
     "files: one photograph": commands(_photograph, ("init", "@"), ("track", "@"), words=("images such as me.jpg",)),
-    "files: a 360° video of two fisheye images": commands(_files("VID.insv"), ("track", "@"), words=("360", "flat")),
+    "files: a 360° video of two fisheye images": commands(
+        named_files("VID.insv"), ("track", "@"), words=("360", "flat")
+    ),
     "files: a 360° video, twice as wide as high": commands(_panorama, ("init", "@"), words=("360", "18:9")),
     "files: an empty folder": commands(_nothing, ("init", "@"), ("track", "@"), words=("no videos", "name a folder")),
     "files: no such folder": commands(_nothing, ("track", "@/nothing"), ("init", "@/nothing"), words=("no such",)),

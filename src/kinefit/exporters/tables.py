@@ -70,6 +70,7 @@ def curves(motion: Motion) -> list[Curve]:
     names, speeds = root_coordinates(motion.body), _speeds(motion)
     turns, turns_std, slopes = _root_turns(y_up)
     R, ones, out = rotation_between_up(motion.up, "y"), np.ones((len(motion), 1)), []
+    by_radians = np.degrees(ones)
     if tree.root_free:
         columns = [*turns.T, *y_up.Ts_world_root[:, :3, 3].T]
         stds = [*turns_std.T, *y_up.dof_std[:, :3].T]
@@ -85,7 +86,7 @@ def curves(motion: Motion) -> list[Curve]:
         if not slides:
             values, std, speed = np.degrees(np.unwrap(values)), np.degrees(std), float(np.degrees(speed))
         joint, _ = split_side(motion.body.joints[tree.owners[d]])
-        unit, by_own = ("m", ones) if slides else ("deg", np.degrees(ones))
+        unit, by_own = ("m", ones) if slides else ("deg", by_radians)
         out.append(Curve(name, joint, split_side(name)[1], unit, values, std, speed, (6 + d,), by_own))
     return out
 

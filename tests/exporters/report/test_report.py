@@ -17,6 +17,7 @@ from kinefit.exporters.report.flagged import close_up, report_frames
 from kinefit.exporters.report.methods import lengths_table, methods_sentences
 from kinefit.exporters.report.moments import (
     doubtful_moments,
+    end_variances,
     never_observed,
     probably_far,
     shared_by_prior,
@@ -220,12 +221,13 @@ def test_the_probability_of_five_centimetres_is_that_of_the_error_bars():
     motion = smooth_motion(5)
     motion = replace(motion, dof_std=np.full_like(motion.dof_std, 1e-6))
     for std in ([0.03, 0.03, 0.03], [0.04, 1e-6, 1e-6], [0.02, 0.05, 0.03]):
-        found = probably_far(replace(motion, joint_std=np.broadcast_to(std, motion.joint_std.shape)))
+        found = probably_far(end_variances(replace(motion, joint_std=np.broadcast_to(std, motion.joint_std.shape))))
         draws = np.linalg.norm(np.random.default_rng(0).normal(0.0, std, (200_000, 3)), axis=1)
         assert found == pytest.approx(np.mean(draws > 0.05), abs=0.02)
     knee = np.full(motion.joint_std.shape, 0.01)
     knee[:, motion.body.tree.segment("shank_l")] = 0.1  # an end of the thigh, too
-    far = probably_far(replace(motion, joint_std=knee)) > 0.5
+    far = probably_far(end_variances(replace(motion, joint_std=knee))) > 0.5
+    assert (probably_far(np.zeros((2, 3, 3))) == 0.0).all()
     names = [name for name, own in zip(motion.body.tree.segments, far.all(axis=0)) if own]
     assert names == ["thigh_l", "shank_l"] and not far[:, motion.body.tree.segment("foot_l")].any()
 

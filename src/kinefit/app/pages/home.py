@@ -57,9 +57,11 @@ def _ask_faces(desk: Desk, t: Texts) -> None:
 
 
 async def _demo(desk: Desk) -> None:
-    """Open the sample recording, written below the session's folder."""
+    """Open the sample recording; it is written below the session's folder, unless it is there, with its corrections."""
+    take = desk.root / "demo" / "take.toml"
     with notified():
-        take = await in_thread(write_sample_take, desk.root / "demo")
+        if not take.is_file():
+            await in_thread(write_sample_take, take.parent)
         ui.navigate.to(link("/take", path=take))
 
 

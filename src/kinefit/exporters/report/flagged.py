@@ -15,7 +15,6 @@ from kinefit.exporters.report.moments import (
     place,
     span,
     spoken_segments,
-    throughout_sentence,
 )
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
@@ -30,12 +29,14 @@ _MAX_TABLE_MOMENTS = 200
 _WARNING, _BAD = "#e0a100", "#d0441c"
 
 
-def flagged(motion: Motion, moments: Sequence[Moment], pictures: Pictures, width: int) -> list[p.Html]:
-    """Parts of the section on doubtful moments; pictures at most `width` px wide."""
+def flagged(
+    motion: Motion, moments: Sequence[Moment], throughout: str, pictures: Pictures, width: int
+) -> list[p.Html]:
+    """Parts of the section on doubtful moments, with `throughout_sentence`; pictures at most `width` px wide."""
     if not motion.residuals and not moments:
         return [p.callout("note", "This motion has no measurements, so doubtful moments are not known.")]
     if not moments:
-        text, throughout = "None: no end of a segment is probably more than 5 cm off", throughout_sentence(motion)
+        text = "None: no end of a segment is probably more than 5 cm off"
         if throughout:
             return [p.callout("note", f"{text} for a moment only. In most frames these are: {throughout}.")]
         return [p.callout("good", f"{text}.")]

@@ -33,6 +33,17 @@ def moving_segments(body: Body) -> NDArray:
     return out
 
 
+def check_frames(motion: Motion, path: str | PathLike[str]) -> None:
+    """Raise ExportError for a motion without frames."""
+    if not len(motion):
+        raise ExportError("a motion without frames cannot be animated", file=path)
+
+
+def linear_colours(colours: NDArray) -> NDArray:
+    """Colours (..., 3) of sRGB, 0 to 255, as linear intensities 0 to 1."""
+    return np.asarray((colours / 255.0) ** 2.2)
+
+
 def turning_segments(body: Body) -> NDArray:
     """(S,) bool: the root, and segments whose joint can turn."""
     out = np.zeros(len(body.tree.segments), bool)

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit._files import writing
 from kinefit.bodies import Body
-from kinefit.errors import ExportError
 from kinefit.exporters.skeletons.common import (
     UNITS,
     Rest,
     bone_names,
+    check_frames,
     euler,
     length_factor,
+    linear_colours,
     moving_segments,
     plain_names,
     rest_pose,
@@ -81,8 +82,7 @@ def write_fbx(
     ExportError
         A motion without frames, unknown unit, axis, names or rest pose, or the file cannot be written.
     """
-    if not len(motion):
-        raise ExportError("a motion without frames cannot be animated", file=path)
+    check_frames(motion, path)
     body, factor, world = motion.body, length_factor(unit, UNITS, path), turned(motion, up, path, _UPS)
     joints, pose = bone_names(body, names, path), rest_pose(body, rest, names, path)
     mesh = pose.posed(body_mesh(body, cylinders=cylinders), body)
@@ -314,8 +314,7 @@ def _add_skin(scene: _Scene, name: str, mesh: TubeMesh, bones: Mapping[str, np.i
     skin = scene.add("Deformer", "skin", "Deformer", "Skin", record("Version", 101), record("Link_DeformAcuracy", 50.0))
     for child, parent in ((model, np.int64(0)), (shape, model), (skin, shape)):
         scene.join(child, parent)
-    for colour in colours:
-        linear = ((colour / 255.0) ** 2.2).tolist()  # of sRGB
+    for colour, linear in zip(colours, linear_colours(colours).tolist()):
         look = scene.add(
             "Material", f"skin_{colour.tobytes().hex()}", "Material", "", record("Version", 102),
             record("ShadingModel", "lambert"), _table(("DiffuseColor", "Color", "", "A", *linear)),

@@ -22,7 +22,9 @@ from kinefit.exporters.skeletons.common import (
     UNITS,
     Rest,
     bone_names,
+    check_frames,
     length_factor,
+    linear_colours,
     moving_segments,
     plain_names,
     rest_pose,
@@ -64,8 +66,7 @@ def write_glb(
     ExportError
         A motion without frames, unknown names or rest pose, or the file cannot be written.
     """
-    if not len(motion):
-        raise ExportError("a motion without frames cannot be animated", file=path)
+    check_frames(motion, path)
     body, tree = motion.body, motion.body.tree
     joints, pose = bone_names(body, names, path), rest_pose(body, rest, names, path)
     nodes: list[dict[str, Any]] = []
@@ -199,8 +200,7 @@ def write_usd(
         from pxr import Tf, Usd
     if Path(path).suffix not in ENDINGS:
         raise ExportError("not a name of a USD file", file=path, remedy=f"Let it end in one of {', '.join(ENDINGS)}.")
-    if not len(motion):
-        raise ExportError("a motion without frames cannot be animated", file=path)
+    check_frames(motion, path)
     factor, world = length_factor(unit, UNITS, path), turned(motion, up, path, _UPS)
     joints = joint_paths(motion.body, bone_names(motion.body, names, path))
     pose = rest_pose(motion.body, rest, names, path)
@@ -297,7 +297,7 @@ def _mesh(stage: Any, content: TubeMesh, T_skeleton_root: NDArray, factor: float
     colour = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
         "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex
     )
-    colour.Set(Vt.Vec3fArray.FromNumpy(np.float32((content.colours / 255.0) ** 2.2)))  # linear, of sRGB
+    colour.Set(Vt.Vec3fArray.FromNumpy(np.float32(linear_colours(content.colours))))
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
     binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
     followed, shares = np.int32(content.segments.ravel()), np.float32(content.weights.ravel())
