@@ -8,6 +8,8 @@ own and are left out of the quick form.
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import tempfile
 import warnings
 import xml.etree.ElementTree as ET
@@ -15,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from benchmarks.bags import Bag
 from benchmarks.figures import LEFT_OUT, figure, peers
@@ -31,6 +34,8 @@ from kinefit.readers.video import Video
 from kinefit.simulation import squat_and_wave
 
 GOAL = "<= 1e-05"
+_FRAMES = 60  # of the motion
+_FBX_READER = Path(__file__).parents[1] / "tests" / "exporters" / "skeletons" / "read_fbx.py"
 Places = dict[str, np.ndarray]
 
 
@@ -173,6 +178,24 @@ def _glb(folder: Path) -> Places:
     return out
 
 
+def _fbx(folder: Path) -> Places:
+    """By ufbx, in a process of its own, as the tests read it."""
+    import ufbx  # noqa: F401, so that its absence is an ImportError here
+
+    def read(times: list[float]) -> dict:
+        command = [sys.executable, str(_FBX_READER), str(folder / "motion.fbx"), json.dumps(times)]
+        return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+
+    _, start, stop = read([0.0])["clips"][0]
+    found = read([float(t) for t in np.linspace(start, stop, _FRAMES)])
+    local = np.array(found["local"])
+    T = np.tile(np.eye(4), (*local.shape[:2], 1, 1))
+    T[..., :3, 3], T[..., :3, :3] = local[..., :3], Rotation.from_quat(local[..., 3:7]).as_matrix()
+    for node, parent in enumerate(found["parents"]):  # parents come first
+        T[:, node] = T[:, parent] @ T[:, node] if parent >= 0 else T[:, node]
+    return dict(zip(found["nodes"], np.moveaxis(T[..., :3, 3], 1, 0)))
+
+
 def _usd(folder: Path) -> Places:
     from pxr import Usd, UsdSkel
 
@@ -283,6 +306,7 @@ Write = Callable[[Motion, Path], object]
 READERS: dict[str, tuple[Write, Callable[[Path], Places], str]] = {
     "bvh_bvhio": (lambda m, f: exporters.write_bvh(m, f / "m.bvh", unit="m"), _bvh, "y"),
     "glb_pygltflib": (lambda m, f: exporters.write_glb(m, f / "motion.glb"), _glb, "y"),
+    "fbx_ufbx": (lambda m, f: exporters.write_fbx(m, f / "motion.fbx", unit="m", up="y"), _fbx, "y"),
     "usd_pxr": (lambda m, f: exporters.write_usd(m, f / "motion.usdc"), _usd, "y"),
     "c3d_ezc3d": (lambda m, f: exporters.write_c3d(m, f / "motion.c3d", up="y"), _c3d, "y"),
     "c3d_c3d": (lambda m, f: exporters.write_c3d(m, f / "motion.c3d", up="y"), _c3d_second, "y"),
