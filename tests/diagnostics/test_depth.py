@@ -39,6 +39,7 @@ def take(folder, counts, *, centre=79.5, keys=""):
     (5000 * scene(), {"keys": "unit = 0.0002"}, []),
     (2000 * scene(), {}, ["unit"]),
     (1000 * scene(radial=True), {}, ["radial"]),
+    (1000 * np.where(scene() < 3.0, scene(radial=True), 0.0) * (Y < 0.35), {}, []),  # a person alone is no wall
     (1000 * scene(), {"centre": 112.0}, ["intrinsics"]),
 ])  # fmt: skip
 def test_units_lenses_and_rays(tmp_path, counts, how, kinds):

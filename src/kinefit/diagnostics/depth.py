@@ -88,10 +88,10 @@ def _along_rays(video: DepthVideo, depth: NDArray) -> list[Finding]:
     known = (z > 0.0) & np.isfinite(table).all(axis=0)
     rays = np.column_stack([*table[:, known], np.ones(known.sum())])
     points = rays * z[known, None]
-    shares = [_plane_share(x) for x in (points, points / np.linalg.norm(rays, axis=1)[:, None])]
+    shares = [known.mean() * _plane_share(x) for x in (points, points / np.linalg.norm(rays, axis=1)[:, None])]
     if shares[1] < max(_MIN_PLANE_SHARE, _MIN_PLANE_GAIN * shares[0]):
         return []
-    on_plane = f"{100 * shares[0]:.0f} and {100 * shares[1]:.0f} % of the points lie on it"
+    on_plane = f"{100 * shares[0]:.0f} and {100 * shares[1]:.0f} % of the pixels lie on it"
     text = f"A wall before {video.sensor} is curved by its depths, and flat if they are along rays ({on_plane})."
     remedy = "Convert them: depth = distance / |ray|, with ray = ((u - cx) / fx, (v - cy) / fy, 1)."
     return [Finding("doubt", "radial", text, (video.sensor,), "A guess.", remedy)]
