@@ -89,9 +89,9 @@ _MORPHS: dict[str, type[Operator]] = {
 
 
 def arrays_of(record: object, shapes: Mapping[str, str], prefix: str = "") -> dict[str, NDArray]:
-    """The fields of a record that `shapes` names, but for those that are None, as arrays; keys begin with `prefix`."""
+    """Arrays, not copied, of the fields that `shapes` names, but for those that are None; keys begin with `prefix`."""
     values = ((name, shape, getattr(record, name)) for name, shape in shapes.items())
-    return {prefix + n: np.array(v, np.str_ if "$" in shape else None) for n, shape, v in values if v is not None}
+    return {prefix + n: np.asarray(v, np.str_ if "$" in shape else None) for n, shape, v in values if v is not None}
 
 
 def fields_of(arrays: Arrays, shapes: Mapping[str, str], sizes: dict[str, int], prefix: str = "") -> dict[str, Any]:

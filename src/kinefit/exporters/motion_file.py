@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import write_lines, writing
+from kinefit._mapped import release
 from kinefit.bodies import Body
 from kinefit.bodies.serial import arrays_of, body_to_arrays
 from kinefit.errors import ExportError
@@ -78,8 +80,12 @@ def _write(path: str | PathLike[str], kind: str, form: Any, arrays: Mapping[str,
     if Path(path).suffix != ".npz":
         raise ExportError(f"{kind} ends in .npz", file=path, remedy=f"Call it {Path(path).stem}.npz.")
     whole = {"format": form.FORMAT, "version": form.VERSION, **arrays}
-    with writing(path) as temporary:
-        np.savez_compressed(temporary, **{key: np.asarray(value) for key, value in whole.items()})  # type: ignore[arg-type]
+    with writing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as file:
+        for key, value in whole.items():  # as numpy.savez_compressed, which would have all in memory at once
+            array = np.asarray(value)
+            with file.open(f"{key}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, array, allow_pickle=False)
+            release(array)
 
 
 FORMAT, VERSION = "kinefit live", 1

@@ -20,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._mapped import room
+from kinefit._mapped import release, room
 from kinefit.bodies import Body, BodyState, KinematicTree
 from kinefit.correspondences import _kernels, targets
 from kinefit.correspondences.closures import closed_at
@@ -51,6 +51,7 @@ MOTION_CORRELATION_TIME = 0.1
 
 _BY_MEASUREMENTS = 0.8  # of a smoothed fit's variance, by errors of measurements, the rest by accelerations. 0.78 to
 # 0.83 by the spectrum of a motion prior that averages 0.2 s, at 30 to 100 Hz, with accelerations of 0.05 to 0.3 s
+_KEPT_AT_ONCE = 1000  # key frames, of which lasting errors fill 11 kB each
 _DIRECTIONS = 120  # of lasting errors that are kept. The sigma of differences on the balancing trial is within 0.3 %
 # of that with all; with 60 within 6 %, with 20 within 43 %
 _NOISE_STRETCHES = 6  # of a long take, from which the detectors' noise is estimated: 12,000 frames are enough
@@ -215,6 +216,8 @@ class _KeyFrames:
         if k < len(self.errors.frames) and self.errors.frames[k] == frame:
             self.errors.constant[k] = product(_with_shapes(errors, shapes, frame), self.constant)
             self.errors.drift[k] = product(errors.drift, self.drift)
+            if k % _KEPT_AT_ONCE == _KEPT_AT_ONCE - 1:
+                release(self.errors.constant, self.errors.drift)
 
 
 def _with_shapes(errors: SystematicErrors, shapes: Sequence[ShapeErrors], frame: int) -> NDArray:
