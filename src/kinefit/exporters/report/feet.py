@@ -78,25 +78,27 @@ def foot_events(motion: Motion) -> Feet | None:
     forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-9)
     ahead = np.einsum("fspi,fi->fsp", feet - hips.mean(axis=1)[:, None, None], forward)
     velocity = np.gradient(smoothed(feet, motion.rate, _SPEED_HZ), 1.0 / motion.rate, axis=0)[..., ::2]
-    belt = _belt(feet, velocity)
+    belt = _belt(feet, velocity, hips.mean(axis=1)[:, ::2], motion.rate)
     speed = np.linalg.norm(velocity - belt, axis=-1)
     least = LEAST_STEP * (motion.body.stature or 1.7)
     left, right = (_events(motion, name, ahead[:, s], speed[:, s], least) for s, name in enumerate(("left", "right")))
     return Feet(left, right, belt)
 
 
-def _belt(feet: NDArray, velocity: NDArray) -> NDArray:
-    """(2,) [m/s] horizontal velocity of the ground: zero, or the belt's.
+def _belt(feet: NDArray, velocity: NDArray, pelvis: NDArray, rate: float) -> NDArray:
+    """(2,) [m/s] horizontal velocity of the ground: zero, or that of a belt on which a person stays about in place.
 
     Parameters
     ----------
     feet : (F, 2, 2, 3) [m] heels and balls, y up; velocity : (F, 2, 2, 2) [m/s] along x and z
+    pelvis : (F, 2) [m] along x and z; rate : float [Hz]
     """
     lower = np.argmin(feet[..., 1].mean(axis=2), axis=1)  # of two feet the one that stands
     frames = np.arange(len(feet))
     slower = np.argmin(np.linalg.norm(velocity[frames, lower], axis=-1), axis=1)
     median = np.median(velocity[frames, lower, slower], axis=0)
-    return np.asarray(median if np.linalg.norm(median) > _LEAST_BELT else np.zeros(2))
+    speed, moved = np.linalg.norm(median), np.linalg.norm(pelvis[-1] - pelvis[0]) * rate / (len(pelvis) - 1)
+    return np.asarray(median if speed > max(_LEAST_BELT, 2.0 * moved) else np.zeros(2))
 
 
 def _events(motion: Motion, side: str, ahead: NDArray, speed: NDArray, least: float) -> FootEvents:

@@ -19,6 +19,8 @@ LENGTHS = "stride length [m]", "speed [m/s]", "step length [m]", "step width [m]
 
 _LEAST_SHARE = 0.3  # of the stature, of a stride that goes anywhere: shorter ones have no direction
 
+_SETTLED = 0.1  # of a stride after contact: the heel slides no more, and does not rise yet
+
 Term = tuple[str, int, float]  # landmark, frame, weight
 
 
@@ -62,9 +64,9 @@ def stride_quantities(motion: Motion, feet: Feet, side: str, times: NDArray) -> 
     Returns
     -------
     {name [unit]: Quantity}
-        Lengths are over the ground, which is a treadmill's belt, too. A step's length is of the step that ends with
-        this foot's contact, its width the other heel's distance from this foot's stride; foot progression is positive
-        with the toes out.
+        Lengths are over the ground, which is a treadmill's belt, too, between heels that stand. A step's length is of
+        the step that ends with this foot's contact, its width the other heel's distance from this foot's stride; foot
+        progression is positive with the toes out.
     """
     own, other = (feet.left, feet.right) if side == "left" else (feet.right, feet.left)
     rows = [_stride(motion, feet.belt, own, other, float(start), float(stop)) for start, stop in times]
@@ -109,8 +111,8 @@ def _lengths(
     motion: Motion, belt: NDArray, side: str, start: float, stop: float, landed: float | None, off: float | None
 ) -> dict[str, tuple[float, float]]:
     """Of a stride of foot "l" or "r", in which the other one lands and this one leaves the ground at times [s]."""
-    way = _Ground(motion, belt)
-    begin, end = (way.frame(t) for t in (start, stop))
+    way, settled = _Ground(motion, belt), _SETTLED * (stop - start)
+    begin, end = (way.frame(t + settled) for t in (start, stop))
     heel, opposite = f"{side}_{HEEL}", f"{'r' if side == 'l' else 'l'}_{HEEL}"
     stride: list[Term] = [(heel, end, 1.0), (heel, begin, -1.0)]
     moved = way.sum_of(stride)
@@ -121,7 +123,7 @@ def _lengths(
     right = np.array([-along[1], along[0]])  # y is up: of x ahead, z is to the right
     out = {"stride length [m]": (length, way.std_of(stride, along))}
     if landed is not None:
-        at = way.frame(landed)
+        at = way.frame(landed + settled)
         step: list[Term] = [(heel, end, 1.0), (opposite, at, -1.0)]
         gone = float(way.sum_of(step) @ along)
         share = 1.0 - gone / length  # of the stride, at which the other foot stands beside its line
@@ -165,7 +167,10 @@ class _Ground:
         world = self._R.T @ np.array([direction[0], 0.0, direction[1]])
         owners = np.array([self._points(name).segments[0] for name, _, _ in terms])
         frames, weights = np.array([term[1] for term in terms]), np.array([term[2] for term in terms])
-        own = np.square(motion.joint_std[frames, owners]) @ np.square(world)
+        stds = motion.joint_std[frames, owners]
+        if not np.isfinite(stds).all():
+            return np.inf
+        own = np.square(stds) @ np.square(world)
         apart = np.abs(motion.times[frames][:, None] - motion.times[frames])
         together, brief = np.zeros((count, count)), own
         if motion.lasting is not None:
@@ -178,7 +183,7 @@ class _Ground:
             brief = np.maximum(own - np.diag(together), 0.0)
         alike = (owners[:, None] == owners) * np.exp(-apart / BRIEF_S)
         together += alike * np.sqrt(np.outer(brief, brief))
-        return float(np.sqrt(max(weights @ together @ weights, 0.0))) if np.isfinite(own).all() else np.inf
+        return float(np.sqrt(max(weights @ together @ weights, 0.0)))
 
     def turn_std_of(self, foot: Sequence[Term], across: NDArray, axis: NDArray) -> float:
         """[rad] standard deviation of the direction of a line `axis` (2,) [m] on a foot, in one frame."""
