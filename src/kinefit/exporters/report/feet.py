@@ -97,7 +97,8 @@ def _belt(feet: NDArray, velocity: NDArray, pelvis: NDArray, rate: float) -> NDA
     frames = np.arange(len(feet))
     slower = np.argmin(np.linalg.norm(velocity[frames, lower], axis=-1), axis=1)
     median = np.median(velocity[frames, lower, slower], axis=0)
-    speed, moved = np.linalg.norm(median), np.linalg.norm(pelvis[-1] - pelvis[0]) * rate / (len(pelvis) - 1)
+    speed = float(np.linalg.norm(median))
+    moved = float(np.linalg.norm(pelvis[-1] - pelvis[0])) * rate / (len(pelvis) - 1)
     return np.asarray(median if speed > max(_LEAST_BELT, 2.0 * moved) else np.zeros(2))
 
 
