@@ -7,6 +7,6 @@ log their figures, unless `--no-log` is given; `python -m benchmarks.ledger` fil
 
 AREAS = (
     "solver", "video", "depth", "silhouettes", "regions", "photogrammetry", "markers", "mixed", "people", "hands",
-    "phones", "closures", "sigma", "product", "faults", "papers", "house",
+    "phones", "closures", "gait", "sigma", "product", "faults", "papers", "house",
 )  # fmt: skip
 """Modules that run alone."""

@@ -17,10 +17,11 @@ from kinefit._arguments import checked
 from kinefit._files import LENGTHS, write_bytes, write_text
 from kinefit.errors import ExportError
 from kinefit.exporters.opensim import trc_head
+from kinefit.exporters.report.cycles import find_cycles
 from kinefit.exporters.skeletons.common import UNITS, bone_names, convention, length_factor, plain_names, turned
 from kinefit.exporters.tables import Curve, curves
 from kinefit.motion import Motion
-from kinefit.observations import Markers
+from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
 
 Value = Sequence[str] | NDArray
@@ -136,7 +137,7 @@ def write_c3d(
     Centres and landmarks are there in all frames, with residual 0: computed, not measured. Angles are points that
     POINT:ANGLES lists, as laboratories' programs expect them: the coordinates of a joint in degrees as x, y and z, as
     `LHipAngles`; missing in frames in which none of them is observed. The first frame's number follows from its time,
-    frame 1 being at 0 s.
+    frame 1 being at 0 s. Contacts and toe-offs of a walk are EVENTs, "Foot Strike" and "Foot Off".
 
     Parameters
     ----------
@@ -174,13 +175,15 @@ def write_c3d(
         fourth[~np.isfinite([c.std for c in found]).any(axis=0), places.shape[1] + k] = -1.0
     turned_by[fourth[:, places.shape[1] :] < 0] = 0.0
     points = np.concatenate([places, turned_by], axis=1)
-    groups: Groups = {
+    groups: dict[str, dict[str, Value]] = {
         "POINT": {
             "UNITS": [unit], "ANGLE_UNITS": ["deg"], "ANGLES": labels[places.shape[1] :], **screens(up),
             **label_groups(labels, about),
         },
         "ANALOG": {"USED": np.array(0, np.uint16), "RATE": np.array(motion.rate, np.float32), "LABELS": []},
     }  # fmt: skip
+    if cycles := find_cycles(motion):
+        groups["EVENT"] = _events(cycles.events)
     write_bytes(path, c3d_bytes(points, fourth, groups, scale=-1.0, rate=motion.rate, first=first))
 
 
@@ -261,7 +264,7 @@ def _c3d(markers: Markers, path: Path, unit: str, factor: float, like: C3d | Non
         "ANALOG": {"USED": np.array(0, np.uint16), "RATE": np.array(markers.rate, np.float32), "LABELS": []},
     }  # fmt: skip
     if markers.events:
-        groups["EVENT"] = _events(markers)
+        groups["EVENT"] = _events(markers.events)
     analog, samples = None, 1
     if like is not None:
         analog, samples = _rows(like, markers, path), like.samples
@@ -300,12 +303,12 @@ def _residual_unit(residual: NDArray) -> float:
     return smallest if own else float(steps[-1]) / _MOST_RESIDUAL
 
 
-def _events(markers: Markers) -> dict[str, Value]:
-    times = np.array([[e.time // 60.0, e.time % 60.0] for e in markers.events], np.float32).T
-    count = len(markers.events)
+def _events(events: Sequence[MarkerEvent]) -> dict[str, Value]:
+    times = np.array([[e.time // 60.0, e.time % 60.0] for e in events], np.float32).T
+    count = len(events)
     return {
-        "USED": np.array(count, np.uint16), "CONTEXTS": [e.context for e in markers.events],
-        "LABELS": [e.label for e in markers.events], "SUBJECTS": [e.subject for e in markers.events], "TIMES": times,
+        "USED": np.array(count, np.uint16), "CONTEXTS": [e.context for e in events],
+        "LABELS": [e.label for e in events], "SUBJECTS": [e.subject for e in events], "TIMES": times,
         "ICON_IDS": np.zeros(count, np.uint16), "GENERIC_FLAGS": np.zeros(count, np.uint8),
     }  # fmt: skip
 

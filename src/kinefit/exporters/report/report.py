@@ -45,6 +45,7 @@ from kinefit.exporters.report.moments import (
     throughout_sentence,
     unmarked,
 )
+from kinefit.exporters.report.strides import Quantity
 from kinefit.exporters.tables import curves, spoken
 from kinefit.findings import listed, of_provenance
 from kinefit.geometry.camera import Rig
@@ -312,31 +313,38 @@ def _cycles(motion: Motion, cycles: Cycles | None, norms: Norms) -> list[p.Html]
     counts = listed([f"{len(s.spans)} {'' if s.name == 'both' else s.name + ' '}cycles" for s in cycles.sides])
     if cycles.kind == "gait":
         text = (
-            f"Gait: {counts}, from heel strike to heel strike (0–100 %), by the distance of the heels ahead of the "
-            "pelvis (Zeni et al. 2008). The dashed vertical line is toe-off. "
+            f"Gait: {counts}, from contact to contact of a foot (0–100 %). A foot stands while its heel or ball is "
+            "slow over the ground. The dashed vertical line is toe-off. "
         )
     else:
         text = f"A repeated movement: {counts}, from one extreme posture to the next of the same kind. "
     text += (
         "The thick line is the mean, thin ones are single cycles. The band is ±1 standard deviation between cycles, "
-        "if there are three or more. The cycles' coefficient of multiple correlation is "
-        f"{cycles.likeness:.2f}."
+        "if there are three or more."
     )
-    numbers = gait_numbers(motion, cycles)
-    rows = [(name, *(_mean(*v) for v in values)) for name, values in numbers.items()]
-    parts = [p.paragraph(text)]
-    if rows:
-        parts.append(p.table(["mean ± SD", *(s.name for s in cycles.sides)], rows))
+    if np.isfinite(cycles.likeness):
+        text += f" The cycles' coefficient of multiple correlation is {cycles.likeness:.2f}."
+    parts = [p.paragraph(text), gait_table(motion, cycles)]
     if norms:
         parts.append(p.paragraph("The grey band is the normative mean ±1 standard deviation of the table given."))
     return [*parts, p.chooser("Joint", cycle_plots(motion, cycles, norms))]
 
 
-def _mean(mean: float, spread: float) -> str:
-    if not np.isfinite(mean):
-        return "–"
-    digits = max(0, 2 - int(np.floor(np.log10(max(abs(mean), 1e-9)))))  # three that count
-    return f"{mean:.{digits}f}" + (f" ± {spread:.{digits}f}" if np.isfinite(spread) else "")
+def gait_table(motion: Motion, cycles: Cycles) -> p.Html:
+    """Numbers of cycles: means with two standard deviations of their errors, and how much single cycles differ."""
+    sides = [side.name for side in cycles.sides]
+    heads = [head for side in sides for head in (f"{side}, mean ± 2 σ", "SD of cycles")]
+    numbers = gait_numbers(motion, cycles)
+    rows = [(name, *(cell for of in each for cell in _cells(of))) for name, each in numbers.items()]
+    return p.table(["", *heads], rows)
+
+
+def _cells(of: Quantity) -> tuple[str, str]:
+    if not np.isfinite(of.mean):
+        return "–", "–"
+    digits = max(0, 2 - int(np.floor(np.log10(max(abs(of.mean), 1e-9)))))  # three that count
+    error = f" ± {2.0 * of.std:.{digits}f}" if np.isfinite(of.std) else ", not observed"
+    return f"{of.mean:.{digits}f}{error}", f"{of.spread:.{digits}f}" if np.isfinite(of.spread) else "–"
 
 
 def _fit(motion: Motion, moments: Sequence[Moment]) -> list[p.Html]:

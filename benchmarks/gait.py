@@ -1,0 +1,10 @@
+"""Figures of gait: `python -m benchmarks.gait`."""
+
+from __future__ import annotations
+
+from benchmarks.figures import run_parts
+
+PARTS = {"gait_events": "contacts, toe-offs and steps of laboratory files, against plates and their own events"}
+
+if __name__ == "__main__":
+    run_parts(PARTS)
