@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -24,6 +25,7 @@ from kinefit.solvers.closed import CLOSED, closed_fit
 from kinefit.solvers.least_squares import levenberg_marquardt
 from kinefit.tracking.recording import Recording
 
+_SIDE = re.compile("^[LR](?=[A-Z])|left|right")
 LEG = ("LKnee", "LAnkle", "LBigToe", "LSmallToe", "LHeel")
 PLACED = "driven"
 RATE = 50.0
@@ -116,15 +118,16 @@ RIDING = {
 """[deg] postures about which people move."""
 
 
-def another_person(generic: Body, random: np.random.Generator) -> Body:
+def another_person(generic: Body, random: np.random.Generator, points_of: str = SET) -> Body:
     """Somebody of another size, each length by itself, whose points a detector sees where it was taught to."""
     size = random.normal(1.0, 0.04)
     body = generic.scaled(size * np.exp(random.normal(0.0, 0.03, len(generic.scale_groups))))
-    points, shifts = body.keypoints(SET), dict[str, NDArray]()
-    for name in points.names:
-        shifts.setdefault(name.lstrip("LR"), random.normal(scale=SHIFT, size=3))
-    side = np.array([[1.0, 1.0, -1.0 if name[0] == "L" else 1.0 if name[0] == "R" else 0.0] for name in points.names])
-    return body.with_keypoints(SET, points.points + np.stack([shifts[n.lstrip("LR")] for n in points.names]) * side)
+    points, shifts = body.keypoints(points_of), dict[str, NDArray]()
+    pairs = [(_SIDE.sub("", name), _SIDE.search(name)) for name in points.names]
+    for name, _ in pairs:
+        shifts.setdefault(name, random.normal(scale=SHIFT, size=3))
+    side = np.array([[1.0, 1.0, 0.0 if s is None else -1.0 if s[0] in ("L", "left") else 1.0] for _, s in pairs])
+    return body.with_keypoints(points_of, points.points + np.stack([shifts[name] for name, _ in pairs]) * side)
 
 
 def _known_stand(body: Body, T: NDArray) -> Body:
@@ -163,7 +166,7 @@ def waves(random: np.random.Generator, count: int):
 
 def from_drive(
     generic: Body, drive, seconds: float, cameras: int, seed: int, leg: bool = False, noise: float = 3.0,
-    of: Body | None = None,
+    of: Body | None = None, points: str = SET,
 ) -> Take:  # fmt: skip
     """A take of whatever a function of time [s] says: a body, the posture it is drawn towards, coordinates it has."""
     frames = int(amount(seconds, min(seconds, 1.0)) * RATE)
@@ -174,7 +177,7 @@ def from_drive(
     motion = _motion(body if of is None else of, states)
     rig = studio_rig(motion, cameras=cameras, up="y")
     seen = simulate_keypoints(
-        motion, rig, SET, noise_px=noise, drift_px=DRIFT, outliers=0.03, missing=0.05, seed=seed
+        motion, rig, points, noise_px=noise, drift_px=DRIFT, outliers=0.03, missing=0.05, seed=seed
     )
     hidden = np.zeros(frames, bool)
     if leg:
