@@ -16,7 +16,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.closures_people import off
-from benchmarks.closures_takes import PLACED, SET, Take, another_person, from_drive, posture_of, towards, wandering, waves
+from benchmarks.closures_takes import (
+    PLACED,
+    SET,
+    Take,
+    another_person,
+    from_drive,
+    posture_of,
+    towards,
+    wandering,
+    waves,
+)
 from benchmarks.figures import amount, figure, quick
 from kinefit.bodies import Body, load_body
 from kinefit.bodies.closures import Closure
@@ -87,7 +97,8 @@ def run() -> None:
                   f"{100 * std:.1f} cm, true {100 * true:.1f}", flush=True)  # fmt: skip
         share = float(np.max(bars)) / (1e3 * sport.std)
         figure(f"{name}: {sport.dimension}, standard deviation over its prior's", share, "of it", "<= 0.7")
-        figure(f"{name}: {sport.dimension}, likewise of points that end at the wrists", by_wrists(name), "of it", "<= 1")
+        ends = by_wrists(name)
+        figure(f"{name}: {sport.dimension}, likewise of points that end at the wrists", ends, "of it", "<= 1")
         figure(f"{name}: mean joint error", float(np.mean(errors)), "mm", "<= 20")
         figure(f"{name}: frames in which no segment of the person is lost", 100 * float(np.mean(whole)), "%", ">= 95")
         figure(f"{name}: {sport.dimension}, worst error", float(np.abs(gear).max()), "mm", f"<= {500 * sport.std:.0f}")

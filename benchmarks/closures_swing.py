@@ -53,7 +53,8 @@ def run() -> None:
         figure("golf swing: markers, RMS residual", 1e3 * motion.provenance["markers"]["rms_m"], "mm", "<= 12")
         others = [gear_of(swing(file, Path(folder), 2 * step, mean=m))["club length"] for m in amount(_OTHER_MEANS, ())]
         if others:
-            print("  club length by priors 10 cm off:", ", ".join(f"{1e3 * v:.0f} ± {1e3 * s:.0f} mm" for v, s in others))
+            told = ", ".join(f"{1e3 * v:.0f} ± {1e3 * s:.0f} mm" for v, s in others)
+            print(f"  club length by priors 10 cm off: {told}")
             apart = 1e3 * float(np.ptp([v for v, _ in others]))
             figure("golf swing: club length, by priors 20 cm apart", apart, "mm apart", "<= 30")
 

@@ -54,8 +54,11 @@ class Take:
     hidden: NDArray
 
 
-def cyclist(seed: int, *, seconds: float = 3.0, cameras: int = 4, leg: bool = False, noise: float = 3.0) -> Take:
-    """Somebody who pedals on a bike that stands, seen by cameras about it."""
+def cyclist(
+    seed: int, *, seconds: float = 3.0, cameras: int = 4, leg: bool = False, noise: float = 3.0, rate: float = RATE,
+    rise: tuple[float, float] | None = None,
+) -> Take:  # fmt: skip
+    """Somebody who pedals on a bike that stands, seen by cameras about it, and rises from the saddle in between."""
     random = np.random.default_rng(seed)
     generic = load_body("cyclist")
     person = another_person(generic, random)
@@ -69,16 +72,32 @@ def cyclist(seed: int, *, seconds: float = 3.0, cameras: int = 4, leg: bool = Fa
 
     def drive(t: float) -> tuple[Body, ParameterRows, dict[int, float]]:
         posture = usual + wave(t) * wandering(person)
-        return person, towards(person, posture), {6 + names.index("crank_angle"): start + cadence * t}
+        turned = {6 + names.index("crank_angle"): start + cadence * t}
+        return person if rise is None else _risen(person, t, rise), towards(person, posture), turned
 
-    return from_drive(generic, drive, seconds, cameras, seed, leg, noise)
+    return from_drive(generic, drive, seconds, cameras, seed, leg, noise, rate=rate)
+
+
+RISE_S, RISEN = 0.4, (0.09, 0.07, 0.0)
+"""[s] in which a rider rises from the saddle, or sits down; [m] of the hips from it then, in the bike's frame."""
+
+
+def _risen(person: Body, t: float, between: tuple[float, float]) -> Body:
+    """The rider with the point that holds the hips above the saddle, between two times [s]."""
+    share = float(np.clip(min(t - between[0], between[1] - t) / RISE_S, 0.0, 1.0))
+    points = np.array(person.landmarks.points)
+    points[person.landmarks.names.index("saddle")] += share * share * (3.0 - 2.0 * share) * np.array(RISEN)
+    return replace(person, landmarks=replace(person.landmarks, points=points))
 
 
 def snowboarder(
     seed: int, *, seconds: float = 3.0, cameras: int = 7, leg: bool = False, noise: float = 3.0,
-    gear: Mapping[str, float] | None = None,
+    gear: Mapping[str, float] | None = None, rate: float = RATE, about_jump: bool = False,
 ) -> Take:  # fmt: skip
-    """Somebody who carves and jumps on a board, which may have other dimensions [m, rad] than the catalogue's."""
+    """Somebody who carves and jumps on a board, which may have other dimensions [m, rad] than the catalogue's.
+
+    The take lasts from 0 s on, or so long about the jump and the turn in it.
+    """
     random = np.random.default_rng(seed)
     generic = load_body("snowboarder")
     person = with_dimensions(another_person(generic, random), gear or {})
@@ -101,7 +120,8 @@ def snowboarder(
                 posture[names.index(f"{name}_{side}")] += share * crouch
         return body, towards(person, posture), {}
 
-    return from_drive(generic, drive, seconds, cameras, seed, leg, noise, person)
+    begin = jump - 0.5 * amount(seconds, min(seconds, 1.0)) if about_jump else 0.0
+    return from_drive(generic, drive, seconds, cameras, seed, leg, noise, person, rate=rate, begin=begin)
 
 
 CYCLING = {
@@ -166,15 +186,15 @@ def waves(random: np.random.Generator, count: int):
 
 def from_drive(
     generic: Body, drive, seconds: float, cameras: int, seed: int, leg: bool = False, noise: float = 3.0,
-    of: Body | None = None, points: str = SET,
+    of: Body | None = None, points: str = SET, rate: float = RATE, begin: float = 0.0,
 ) -> Take:  # fmt: skip
     """A take of whatever a function of time [s] says: a body, the posture it is drawn towards, coordinates it has."""
-    frames = int(amount(seconds, min(seconds, 1.0)) * RATE)
+    frames = int(amount(seconds, min(seconds, 1.0)) * rate)
     states, body = list[BodyState](), generic
     for f in range(frames):
-        body, towards, driven = drive(f / RATE)
+        body, towards, driven = drive(begin + f / rate)
         states.append(_solved(body, towards, driven, states[-1] if states else None))
-    motion = _motion(body if of is None else of, states)
+    motion = _motion(body if of is None else of, states, rate)
     rig = studio_rig(motion, cameras=cameras, up="y")
     seen = simulate_keypoints(
         motion, rig, points, noise_px=noise, drift_px=DRIFT, outliers=0.03, missing=0.05, seed=seed
@@ -244,10 +264,10 @@ def _solved(body: Body, towards: ParameterRows, driven: dict[int, float], last: 
     return fit.state
 
 
-def _motion(body: Body, states: list[BodyState]) -> Motion:
+def _motion(body: Body, states: list[BodyState], rate: float) -> Motion:
     count = len(states)
     return Motion(
-        body, RATE, np.arange(count) / RATE, np.stack([s.T_world_root for s in states]),
+        body, rate, np.arange(count) / rate, np.stack([s.T_world_root for s in states]),
         np.stack([s.angles for s in states]), np.zeros((count, body.tree.n_dofs)),
         np.zeros((count, len(body.tree.segments), 3)), np.ones(count), np.ones((count, len(body.tree.segments))),
         up="y",

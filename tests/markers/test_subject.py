@@ -4,8 +4,8 @@ import warnings
 
 import numpy as np
 import pytest
-
 from benchmarks.closures_swing import HERE, OBSERVED, PRIORS, gear_of, swing
+
 from kinefit import Markers, load_body
 from kinefit.bodies import BodyState
 from kinefit.bodies.marker_sets import placement

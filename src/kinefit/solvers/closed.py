@@ -226,7 +226,8 @@ class ClosureForces:
 
     def __str__(self) -> str:
         if self.unsupported:
-            return f"no equilibrium: nothing balances the load on {', '.join(self.unsupported)}. Name what does in `active`."
+            stuck = ", ".join(self.unsupported)
+            return f"no equilibrium: nothing balances the load on {stuck}. Name what does in `active`."
         lines = [f"{name}: {value:.1f} N{' m' * (' about ' in name)}" for name, value in self.forces.items()]
         lines += [f"torque of {name}: {value:.1f} N m" for name, value in self.torques.items()]
         if self.undetermined:

@@ -83,7 +83,7 @@ def of_points(
     recording: Recording, generic: Body, subject: Subject, height: float | None, trial: Subject | None, *,
     calibrated: Rig | None = None, cameras: CameraErrors | None = None, states: Sequence[BodyState] = (),
 ) -> Unknowns | None:  # fmt: skip
-    """Lengths, gear, places of keypoints, markers and cameras, where there are markers; else the keypoints' fit is that.
+    """Lengths, gear, offsets of points, and cameras, where there are markers; else the keypoints' fit has them.
 
     They have the generic body's prior: the fit from one kind of sensors that came first says where to begin, and is not
     counted again.
