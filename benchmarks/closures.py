@@ -11,6 +11,7 @@ PARTS = {
     "closures_people": "a cyclist and a snowboarder, simulated, with closures and without",
     "closures_gear": "dimensions of gear that are estimated",
     "closures_sports": "a rower, a lifter and a golfer, with a dimension of their gear estimated",
+    "closures_swing": "a real golf swing by markers: how the club is held",
     "closures_contacts": "feet that leave the ground and come back",
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -24,6 +25,7 @@ from kinefit.solvers.closed import CLOSED, closed_fit
 from kinefit.solvers.least_squares import levenberg_marquardt
 from kinefit.tracking.recording import Recording
 
+_SIDE = re.compile("^[LR](?=[A-Z])|left|right")
 LEG = ("LKnee", "LAnkle", "LBigToe", "LSmallToe", "LHeel")
 PLACED = "driven"
 RATE = 50.0
@@ -52,8 +54,11 @@ class Take:
     hidden: NDArray
 
 
-def cyclist(seed: int, *, seconds: float = 3.0, cameras: int = 4, leg: bool = False, noise: float = 3.0) -> Take:
-    """Somebody who pedals on a bike that stands, seen by cameras about it."""
+def cyclist(
+    seed: int, *, seconds: float = 3.0, cameras: int = 4, leg: bool = False, noise: float = 3.0, rate: float = RATE,
+    rise: tuple[float, float] | None = None,
+) -> Take:  # fmt: skip
+    """Somebody who pedals on a bike that stands, seen by cameras about it, and rises from the saddle in between."""
     random = np.random.default_rng(seed)
     generic = load_body("cyclist")
     person = another_person(generic, random)
@@ -67,16 +72,32 @@ def cyclist(seed: int, *, seconds: float = 3.0, cameras: int = 4, leg: bool = Fa
 
     def drive(t: float) -> tuple[Body, ParameterRows, dict[int, float]]:
         posture = usual + wave(t) * wandering(person)
-        return person, towards(person, posture), {6 + names.index("crank_angle"): start + cadence * t}
+        turned = {6 + names.index("crank_angle"): start + cadence * t}
+        return person if rise is None else _risen(person, t, rise), towards(person, posture), turned
 
-    return from_drive(generic, drive, seconds, cameras, seed, leg, noise)
+    return from_drive(generic, drive, seconds, cameras, seed, leg, noise, rate=rate)
+
+
+RISE_S, RISEN = 0.4, (0.09, 0.07, 0.0)
+"""[s] in which a rider rises from the saddle, or sits down; [m] of the hips from it then, in the bike's frame."""
+
+
+def _risen(person: Body, t: float, between: tuple[float, float]) -> Body:
+    """The rider with the point that holds the hips above the saddle, between two times [s]."""
+    share = float(np.clip(min(t - between[0], between[1] - t) / RISE_S, 0.0, 1.0))
+    points = np.array(person.landmarks.points)
+    points[person.landmarks.names.index("saddle")] += share * share * (3.0 - 2.0 * share) * np.array(RISEN)
+    return replace(person, landmarks=replace(person.landmarks, points=points))
 
 
 def snowboarder(
     seed: int, *, seconds: float = 3.0, cameras: int = 7, leg: bool = False, noise: float = 3.0,
-    gear: Mapping[str, float] | None = None,
+    gear: Mapping[str, float] | None = None, rate: float = RATE, about_jump: bool = False,
 ) -> Take:  # fmt: skip
-    """Somebody who carves and jumps on a board, which may have other dimensions [m, rad] than the catalogue's."""
+    """Somebody who carves and jumps on a board, which may have other dimensions [m, rad] than the catalogue's.
+
+    The take lasts from 0 s on, or so long about the jump and the turn in it.
+    """
     random = np.random.default_rng(seed)
     generic = load_body("snowboarder")
     person = with_dimensions(another_person(generic, random), gear or {})
@@ -99,7 +120,8 @@ def snowboarder(
                 posture[names.index(f"{name}_{side}")] += share * crouch
         return body, towards(person, posture), {}
 
-    return from_drive(generic, drive, seconds, cameras, seed, leg, noise, person)
+    begin = jump - 0.5 * amount(seconds, min(seconds, 1.0)) if about_jump else 0.0
+    return from_drive(generic, drive, seconds, cameras, seed, leg, noise, person, rate=rate, begin=begin)
 
 
 CYCLING = {
@@ -116,15 +138,16 @@ RIDING = {
 """[deg] postures about which people move."""
 
 
-def another_person(generic: Body, random: np.random.Generator) -> Body:
+def another_person(generic: Body, random: np.random.Generator, points_of: str = SET) -> Body:
     """Somebody of another size, each length by itself, whose points a detector sees where it was taught to."""
     size = random.normal(1.0, 0.04)
     body = generic.scaled(size * np.exp(random.normal(0.0, 0.03, len(generic.scale_groups))))
-    points, shifts = body.keypoints(SET), dict[str, NDArray]()
-    for name in points.names:
-        shifts.setdefault(name.lstrip("LR"), random.normal(scale=SHIFT, size=3))
-    side = np.array([[1.0, 1.0, -1.0 if name[0] == "L" else 1.0 if name[0] == "R" else 0.0] for name in points.names])
-    return body.with_keypoints(SET, points.points + np.stack([shifts[n.lstrip("LR")] for n in points.names]) * side)
+    points, shifts = body.keypoints(points_of), dict[str, NDArray]()
+    pairs = [(_SIDE.sub("", name), _SIDE.search(name)) for name in points.names]
+    for name, _ in pairs:
+        shifts.setdefault(name, random.normal(scale=SHIFT, size=3))
+    side = np.array([[1.0, 1.0, 0.0 if s is None else -1.0 if s[0] in ("L", "left") else 1.0] for _, s in pairs])
+    return body.with_keypoints(points_of, points.points + np.stack([shifts[name] for name, _ in pairs]) * side)
 
 
 def _known_stand(body: Body, T: NDArray) -> Body:
@@ -163,18 +186,18 @@ def waves(random: np.random.Generator, count: int):
 
 def from_drive(
     generic: Body, drive, seconds: float, cameras: int, seed: int, leg: bool = False, noise: float = 3.0,
-    of: Body | None = None,
+    of: Body | None = None, points: str = SET, rate: float = RATE, begin: float = 0.0,
 ) -> Take:  # fmt: skip
     """A take of whatever a function of time [s] says: a body, the posture it is drawn towards, coordinates it has."""
-    frames = int(amount(seconds, min(seconds, 1.0)) * RATE)
+    frames = int(amount(seconds, min(seconds, 1.0)) * rate)
     states, body = list[BodyState](), generic
     for f in range(frames):
-        body, towards, driven = drive(f / RATE)
+        body, towards, driven = drive(begin + f / rate)
         states.append(_solved(body, towards, driven, states[-1] if states else None))
-    motion = _motion(body if of is None else of, states)
+    motion = _motion(body if of is None else of, states, rate)
     rig = studio_rig(motion, cameras=cameras, up="y")
     seen = simulate_keypoints(
-        motion, rig, SET, noise_px=noise, drift_px=DRIFT, outliers=0.03, missing=0.05, seed=seed
+        motion, rig, points, noise_px=noise, drift_px=DRIFT, outliers=0.03, missing=0.05, seed=seed
     )
     hidden = np.zeros(frames, bool)
     if leg:
@@ -241,10 +264,10 @@ def _solved(body: Body, towards: ParameterRows, driven: dict[int, float], last: 
     return fit.state
 
 
-def _motion(body: Body, states: list[BodyState]) -> Motion:
+def _motion(body: Body, states: list[BodyState], rate: float) -> Motion:
     count = len(states)
     return Motion(
-        body, RATE, np.arange(count) / RATE, np.stack([s.T_world_root for s in states]),
+        body, rate, np.arange(count) / rate, np.stack([s.T_world_root for s in states]),
         np.stack([s.angles for s in states]), np.zeros((count, body.tree.n_dofs)),
         np.zeros((count, len(body.tree.segments), 3)), np.ones(count), np.ones((count, len(body.tree.segments))),
         up="y",

@@ -6,6 +6,7 @@ Keypoints are of the first frame alone. Cameras are written as a calibration has
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from benchmarks.gear_things import box, piece
 from kinefit.bodies import load_body
 from kinefit.bodies.toml.bodies import catalogue_text
 from kinefit.geometry import se3
+from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import movement, simulate_keypoints, studio_rig
@@ -45,6 +47,7 @@ class GearTake:
     hidden : (F,) bool, frames in which the left leg is behind a cover
     seed : int
     videos : int, of the cameras, whose colours are used; the others have the keypoints of the first frame alone
+    without : names of closures that the body is tracked without
     """
 
     name: str
@@ -53,17 +56,18 @@ class GearTake:
     hidden: NDArray
     seed: int
     videos: int
+    without: tuple[str, ...] = ()
 
     def write(self, folder: Path, *, closures: bool) -> Path:
         """The take file, with a body file that holds closures or does not; videos are written once."""
         folder.mkdir(parents=True, exist_ok=True)
         rig = self.scene.rig
-        (folder / f"{self.name}_{closures}.toml").write_text(body_text(self.name, closures))
+        (folder / f"{self.name}_{closures}.toml").write_text(body_text(self.name, closures, self.without))
         take = folder / f"take_{closures}.toml"
         take.write_text(_take(self, f"{self.name}_{closures}.toml"))
         if not (folder / "calibration.toml").exists():
             for camera in rig.cameras[: self.videos]:
-                _video(self.scene, camera, folder / f"{camera.name}.mp4")
+                _video(self.scene, camera, folder / f"{camera.name}.mp4", self.truth.rate)
             seen = simulate_keypoints(
                 self.truth, rig, SET, noise_px=_NOISE, drift_px=_DRIFT, outliers=0.03, missing=0.05, seed=self.seed
             )
@@ -73,9 +77,12 @@ class GearTake:
         return take
 
 
-def body_text(name: str, closures: bool) -> str:
+def body_text(name: str, closures: bool, without: Sequence[str] = ()) -> str:
     """The catalogue's body file without surfaces of gear, which no sensor then looks for; and without closures."""
     text, out, inside = catalogue_text(name), [], False
+    for one in without:
+        before, after = text.split(f'[[closure]]\nname = "{one}"\n')
+        text = before + after[after.index("\n[") + 1 :]
     for line in (text if closures else text.split("[[closure]]")[0]).splitlines():
         starts = line.startswith("surface = ")
         inside = (inside or starts) and not (line == "]" or (starts and not line.endswith("[")))
@@ -85,18 +92,19 @@ def body_text(name: str, closures: bool) -> str:
 
 
 def _take(take: GearTake, body: str) -> str:
-    text = f'[take]\nup = "y"\nrate = {RATE}\nbody = "{body}"\nheight = {take.truth.body.stature:.2f}\n'
+    text = f'[take]\nup = "y"\nrate = {take.truth.rate}\nbody = "{body}"\nheight = {take.truth.body.stature:.2f}\n'
     text += '[calibration]\nfile = "calibration.toml"\n'
     for k, name in enumerate(take.scene.rig.names):
         text += f'[[camera]]\nname = "{name}"\n'
         text += f'video = "{name}.mp4"\n[[region]]\ncamera = "{name}"\n' if k < take.videos else ""
-        text += f'[[keypoints]]\ncamera = "{name}"\nfile = "{name}"\nset = "{SET}"\nrate = {RATE}\nframes = [0, 1]\n'
+        text += f'[[keypoints]]\ncamera = "{name}"\nfile = "{name}"\nset = "{SET}"\n'
+        text += f"rate = {take.truth.rate}\nframes = [0, 1]\n"
     return text
 
 
-def _video(scene: GearScene, camera, path: Path) -> None:
+def _video(scene: GearScene, camera, path: Path, rate: float) -> None:
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=int(RATE), options={"crf": "16", "preset": "veryfast"})
+        stream = container.add_stream("libx264", rate=round(rate), options={"crf": "16", "preset": "veryfast"})
         stream.width, stream.height, stream.pix_fmt = *camera.size, "yuv420p"
         for image in scene.images(camera):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
@@ -113,15 +121,17 @@ def _keypoints(seen, folder: Path) -> None:
 
 
 def rendered_cyclist(
-    seed: int, *, cover: bool = False, seconds: float = SECONDS, videos: int = VIDEOS, shutter: float = 0.0
-) -> GearTake:
+    seed: int, *, cover: bool = False, seconds: float = SECONDS, videos: int = VIDEOS, shutter: float = 0.0,
+    cameras: int = 4, rate: float = RATE, size: float = 1.0, rise: tuple[float, float] | None = None,
+) -> GearTake:  # fmt: skip
     """In a lab, four cameras; the bike stands in view. The cover comes up before the left leg after a fifth.
 
-    The shutter is open for a part of the time between two images, which blurs what moves.
+    The shutter is open for a part of the time between two images, which blurs what moves. Images are `size` times
+    640 × 480 px. A rider who rises from the saddle between two times [s] is tracked without its closure.
     """
-    truth = cyclist(seed, seconds=amount(seconds, 0.12)).truth
+    truth = cyclist(seed, seconds=amount(seconds, 0.12), rate=rate, rise=rise).truth
     random, count = np.random.default_rng((seed, 50)), len(truth)
-    rig = studio_rig(truth, cameras=4, up="y", size=SIZE, focal=FOCAL)
+    rig = _rig(truth, cameras, size)
     moving, hidden = draw.dressed(truth, random), np.zeros(count, bool)
     moving = draw.painted(moving, truth.body, "bike", (0.7, 0.1, 0.1))
     if cover:
@@ -137,25 +147,28 @@ def rendered_cyclist(
                   np.full((count, len(rig)), 0.95))  # fmt: skip
     ground = draw.lab_ground(centre, away + 1.2, seed)
     scene = _scene(moving, things, rig, light, ground, shutter, seed, centre)
-    return GearTake("cyclist", truth, scene, hidden, seed, videos)
+    return GearTake("cyclist", truth, scene, hidden, seed, min(videos, cameras), ("seat",) if rise else ())
 
 
-def rendered_snowboarder(seed: int, *, cover: bool = False, seconds: float = SECONDS) -> GearTake:
+def rendered_snowboarder(
+    seed: int, *, cover: bool = False, seconds: float = SECONDS, cameras: int = 7, rate: float = RATE,
+    size: float = 1.0, about_jump: bool = False,
+) -> GearTake:  # fmt: skip
     """Outdoors, seven cameras, clouds, a second person; the cover, of spray, is about the left shank and boot."""
-    truth = snowboarder(seed, seconds=amount(seconds, 0.2)).truth
+    truth = snowboarder(seed, seconds=amount(seconds, 0.2), rate=rate, about_jump=about_jump).truth
     random, count = np.random.default_rng((seed, 51)), len(truth)
-    rig = studio_rig(truth, cameras=7, up="y", size=SIZE, focal=FOCAL)
+    rig = _rig(truth, cameras, size)
     moving, hidden = draw.dressed(truth, random), np.zeros(count, bool)
     moving = draw.painted(moving, truth.body, "board", random.uniform(0.1, 0.9, 3))
     centre = moving.posed(count // 2).mean(axis=0) * (1, 0, 1)
-    walker = _walker(centre, count, random)
+    walker = _walker(centre, count, random, rate)
     parts = [moving, draw.dressed(walker, random)]
     if cover:
         hidden[count // 5 :] = True
         parts.append(_spray(truth, hidden))
     moving = draw.together(*parts)
     light = Light(_unit(*random.uniform((-0.8, 0.6, -0.8), (0.8, 0.9, 0.8))), np.array([1.0, 0.94, 0.82]) * 0.75,
-                  np.array([0.27, 0.31, 0.38]), *clouds(count, RATE, len(rig), random))  # fmt: skip
+                  np.array([0.27, 0.31, 0.38]), *clouds(count, rate, len(rig), random))  # fmt: skip
     things = draw.scattered(random, centre, 2.6, 9.0, 30, seed)
     ground = draw.slope_ground(centre, 16.0, seed)
     scene = _scene(moving, things, rig, light, ground, 0.5, seed, centre)
@@ -185,15 +198,22 @@ def _unit(*v: float) -> NDArray:
     return np.array(v) / np.linalg.norm(v)
 
 
-def _walker(centre: NDArray, count: int, random: np.random.Generator) -> Motion:
+def _rig(truth: Motion, cameras: int, size: float) -> Rig:
+    return studio_rig(
+        truth, cameras=cameras, up="y", size=(int(size * SIZE[0]), int(size * SIZE[1])), focal=size * FOCAL
+    )
+
+
+def _walker(centre: NDArray, count: int, random: np.random.Generator, rate: float) -> Motion:
     """Somebody else, who walks by two metres away."""
-    walk = movement("walk", load_body("humanoid"), rate=RATE)
+    walk = movement("walk", load_body("humanoid"), rate=rate)
     turn, away = random.uniform(0.0, 2.0 * np.pi), random.uniform(1.7, 2.3)
     T = se3.transform(se3.exp_so3(np.array([0.0, turn, 0.0])), np.zeros(3))
-    Ts = T @ walk.Ts_world_root[40 : 40 + count]
+    part = slice(round(0.8 * rate), round(0.8 * rate) + count)
+    Ts = T @ walk.Ts_world_root[part]
     middle = Ts[count // 2, :3, 3] * (1, 0, 1)
     Ts[:, :3, 3] += centre - middle + away * np.array([np.cos(turn + 2.0), 0.0, np.sin(turn + 2.0)])
-    return known_motion(walk.body, RATE, Ts, walk.angles[40 : 40 + count])
+    return known_motion(walk.body, rate, Ts, walk.angles[part])
 
 
 def _spray(truth: Motion, hidden: NDArray) -> Thing:

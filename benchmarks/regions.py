@@ -11,6 +11,7 @@ PARTS = {
     "regions_people": "the balancing trial by colours alone, beside keypoints, and by the paper's own recipe",
     "regions_gear": "a rendered cyclist in a lab and a snowboarder outdoors, with closures and without",
     "regions_few": "the cyclist by one camera and two, blurred, with closures and without",
+    "regions_jumps": "jumps, turns, riders who rise, seconds of pedalling, at 100 Hz by four and seven cameras",
     "regions_speed": "time of a frame of a whole person",
 }
 

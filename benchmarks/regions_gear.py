@@ -148,7 +148,7 @@ def subtraction(f: Followed) -> None:
                 plain[t].append(_iou(_largest(away > t), rider))
             plate.append(_iou(own.mask(image) > 0, rider))
             person = rider & ~np.append(gear, False)[np.where(rider, raster.segment, -1)]
-            fitted.append(_iou(_drawn(f.closed, i, camera), person))
+            fitted.append(_iou(drawn(f.closed, i, camera), person))
     best = max(THRESHOLDS, key=lambda t: np.mean(plain[t]))
     figure("snowboarder_subtraction_iou", float(np.mean(plain[best])), "", "<= 0.7")
     print(f"  by the best of {len(THRESHOLDS)} thresholds, {best} grey levels; a plate with shadows left out "
@@ -166,7 +166,7 @@ def _iou(a: NDArray, b: NDArray) -> float:
     return float((a & b).sum() / max((a | b).sum(), 1))
 
 
-def _drawn(motion: Motion, frame: int, camera: Camera) -> NDArray:
+def drawn(motion: Motion, frame: int, camera: Camera) -> NDArray:
     return np.array(render_body(motion.body, motion.state(frame), camera, mesh=body_mesh(motion.body)).seen)
 
 
@@ -179,7 +179,7 @@ def picture(whole: Followed, hidden: Followed) -> None:
         for camera in list(f.take.scene.rig)[:3]:
             image = next(iter(f.take.scene.images(camera, [frame])))
             found, _ = cv2.findContours(
-                _drawn(f.closed, frame, camera).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
+                drawn(f.closed, frame, camera).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
             )
             row.append(cv2.drawContours(np.ascontiguousarray(image[..., ::-1]), found, -1, (0, 255, 255), 2))
         rows.append(np.hstack(row))

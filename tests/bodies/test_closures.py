@@ -1,5 +1,7 @@
 """Closures and dimensions of body files: what they say, what they become on other bodies, what is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -87,6 +89,15 @@ def test_dimensions_move_what_they_name():
     np.testing.assert_allclose(np.degrees(boots.closures[0].turn), [0.0, 25.0, 0.0], atol=1e-9)
     back = with_dimensions(longer, {"crank length": 0.17, "saddle height": 0.75})
     np.testing.assert_allclose(back.tree.offsets, body.tree.offsets, atol=1e-15)
+
+
+def test_keypoints_and_markers_on_a_landmark_go_where_a_dimension_moves_it():
+    body = load_body("snowboarder")
+    marks = replace(body.landmarks.select(("left_binding", "r_knee")), names=("a", "b"))
+    body = replace(body, keypoint_sets={"K": marks}, marker_sets={"M": marks})
+    wider = with_dimensions(body, {"boot distance": 0.55})
+    for points in (wider.keypoints("K"), wider.markers("M")):
+        np.testing.assert_allclose(points.points - marks.points, [[0.0, 0.0, -0.03], [0.0, 0.0, 0.0]], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["cyclist", "snowboarder"])

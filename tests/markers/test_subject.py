@@ -4,15 +4,20 @@ import warnings
 
 import numpy as np
 import pytest
+from benchmarks.closures_swing import HERE, OBSERVED, PRIORS, gear_of, swing
 
 from kinefit import Markers, load_body
+from kinefit.bodies import BodyState
 from kinefit.bodies.marker_sets import placement
+from kinefit.bodies.parts import with_dimensions
+from kinefit.correspondences.closures import closed_at
 from kinefit.errors import KinefitError, ObservationError, TrackingError
 from kinefit.evaluation import joint_errors
 from kinefit.markers.poses import columns, split_people
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.readers.markers import read_markers
 from kinefit.simulation import squat_and_wave
+from kinefit.solvers.closed import onto
 from kinefit.tracking.markers import fit_markers
 
 BODY = load_body("humanoid")
@@ -145,3 +150,34 @@ def test_labels_spelt_otherwise_are_the_same_markers(known):
     doubled = Markers(("A:lasi", "B:LAsi"), 60.0, np.zeros((1, 2, 3)))
     with pytest.raises(ObservationError, match="more than one subject"):
         columns(doubled, ("LASI",))
+
+
+def test_gear_is_found_with_lengths_and_offsets_of_markers():
+    """A club with markers in two hands: its length, at 10 cm of 90, and no more of the hands' angle than its prior."""
+    generic, rng = load_body(HERE / "body.toml"), np.random.default_rng(1)
+    true = with_dimensions(generic.scaled(np.full(len(generic.scale_groups), 1.04)), {"club length": 0.78})
+    points, tree = placement(true, HERE / "markers.toml").points, true.tree
+    sways = 0.3 * np.where(np.isfinite(tree.spread), np.minimum(tree.spread, 0.7), 0.0) * rng.uniform(-1.0, 1.0, (2, 1))
+    sways = sways * rng.uniform(-1.0, 1.0, (2, len(tree.usual)))
+    closed = lambda state: (closed_at(true, state).value, closed_at(true, state).jacobian)
+    x = []
+    for phase in np.linspace(0.0, 2.0 * np.pi, 30, endpoint=False):
+        angles = tree.usual + sways[0] * np.sin(phase) + sways[1] * np.cos(phase)
+        state, off = onto(true, BodyState(np.eye(4), np.clip(angles, tree.lower, tree.upper)), closed)
+        assert off < 1e-6
+        x.append(true.positions(state, points) + rng.normal(scale=0.004, size=(len(points), 3)))
+    markers = Markers(points.names, 30.0, np.array(x), up="y")
+    found = fit_marker_subject(generic, markers, HERE / "markers.toml", frames=12)
+    value, std = found.fit.value("gear club length")
+    assert value == pytest.approx(0.78, abs=min(2.0 * std, 0.05)) and std < 0.05
+    assert {d.name: d.std for d in found.body.dimensions} == dict.fromkeys(PRIORS, 0.0)
+    assert found.body.dimensions[0].value == pytest.approx(value)
+    assert PRIORS["shaft angle"] > found.fit.value("gear shaft angle")[1] > 0.6 * PRIORS["shaft angle"]
+
+
+def test_a_real_swing_tells_where_the_club_is_held(data_dir, tmp_path):
+    folder = data_dir("markers/btkdata")
+    found = gear_of(swing(next(folder.glob("*golfswing.c3d")), tmp_path, 20))
+    assert all(found[name][1] < 0.7 * PRIORS[name] for name in OBSERVED)
+    assert all(0.0 < std <= PRIORS[name] for name, (_, std) in found.items())
+    assert 0.90 < found["club length"][0] < 1.02

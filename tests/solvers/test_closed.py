@@ -120,19 +120,20 @@ def test_a_pedal_under_a_known_load_is_pushed_along_the_line_through_the_hip(leg
     lever = np.cross(foot - axis, along)[2]  # the force on the crank is the opposite of that on the foot
     crank = state.angles[2]
     R = np.array([[np.cos(crank), -np.sin(crank)], [np.sin(crank), np.cos(crank)]])
-    on_foot = np.array([*(R @ found.force[:2]), found.force[2]])
+    assert found.undetermined == ("foot along z",)  # a plane's mechanism says nothing across it
+    assert "foot along z" not in found.forces and "not determined: foot along z." in str(found)
+    on_foot = np.array([*(R @ [found.forces["foot along x"], found.forces["foot along y"]]), 0.0])
     np.testing.assert_allclose(on_foot, torque / lever * along, atol=1e-9)
-    assert found.names[:2] == ("foot along x", "foot along y") and found.determined[:2].all()
-    assert not found.determined[2]  # a plane's mechanism says nothing across it
     needed = -np.cross(foot - knee, on_foot)[2]
-    assert found.torque[6 + leg.tree.coordinate("knee")] == pytest.approx(needed, abs=1e-9)
+    assert found.torques == {"knee": pytest.approx(needed, abs=1e-9)}
     assert np.abs(found.unbalanced).max() < 1e-9
     weight = load_of(leg, state, leg.landmarks.select(("joint",)), [[0.0, -80.0, 0.0]])
     assert weight[6 + leg.tree.coordinate("hip")] == pytest.approx(-80.0 * knee[0], abs=1e-9)
     assert not weight[[6 + leg.tree.coordinate("knee"), 6 + leg.tree.coordinate("axis")]].any()
     pushed = closure_forces(leg, state, load, active=["hip", "knee"])  # then the crank alone says something
-    assert pushed.determined.tolist() == [True, False, False]
-    assert pushed.force[0] == pytest.approx(-torque / 0.15, abs=1e-9) and np.abs(pushed.unbalanced).max() < 1e-9
+    assert pushed.undetermined == ("foot along y", "foot along z", "hip", "knee") and not pushed.torques
+    assert pushed.forces == {"foot along x": pytest.approx(-torque / 0.15, abs=1e-9)}
+    assert np.abs(pushed.unbalanced).max() < 1e-9
 
 
 def test_forces_of_closures_of_a_body_with_gear():
@@ -142,10 +143,32 @@ def test_forces_of_closures_of_a_body_with_gear():
     assert off <= CLOSED
     load = load_of(body, state, body.landmarks.select(("bar_middle",)), [[0.0, -200.0, 0.0]])
     found = closure_forces(body, state, load)
-    grip = body.tree.segment_poses(state.T_world_root[None], state.angles[None])[0, body.tree.segment("bar"), :3, :3]
     assert np.linalg.norm(found.unbalanced[:3] - [0.0, -200.0, 0.0]) < 1e-6  # nothing holds the root
-    assert found.force.shape == (3,) and np.isfinite(grip @ found.force).all()
+    assert not found.forces and {f"left hand along {axis}" for axis in "xyz"} <= set(found.undetermined)
+    assert "lumbar_extension" in found.torques  # both arms can press the bar together, which no trunk takes part in
+    of_left_arm = [n for n in body.tree.coordinates if n.endswith("_l")]
+    loose = closure_forces(body, state, load, active=of_left_arm)
+    assert not loose.forces and "no equilibrium: nothing balances the load on lumbar_extension" in str(loose)
     with pytest.raises(BodyError, match="no closures"):
         closure_forces(load_body("humanoid"), load_body("humanoid").usual_state(), np.zeros(47))
     with pytest.raises(BodyError, match="wing"):
         closure_forces(body, state, load, active=["wing"])
+
+
+@pytest.mark.parametrize(("name", "closure"), [("cyclist", "left cleat"), ("snowboarder", "left boot")])
+def test_what_two_legs_can_press_together_has_no_force(name, closure):
+    """A crank that is braked, or a board that is loaded: one leg alone bears it, of two nobody knows which."""
+    body = load_body(name)
+    state, _ = onto(body, body.usual_state(), lambda s: (closed_at(body, s).value, closed_at(body, s).jacobian))
+    load = np.zeros(body.tree.n_dofs)
+    if name == "cyclist":
+        load[6 + body.tree.coordinate("crank_angle")] = 25.0
+    found = closure_forces(body, state, load)
+    along = [f"{closure} along {axis}" for axis in "xyz"]
+    assert set(along) <= set(found.undetermined) and not set(along) & set(found.forces)
+    assert all(np.isfinite([*found.forces.values(), *found.torques.values()]))
+    assert "Active joints can press these against each other" in str(found)
+    left = closure_forces(body, state, load, active=[n for n in body.tree.coordinates if n.endswith("_l")])
+    if name == "cyclist":  # its left leg alone
+        across = np.array([left.forces[a] for a in along[:2]])
+        assert np.linalg.norm(across) > 25.0 / 0.17 - 1e-6 and along[2] in left.undetermined

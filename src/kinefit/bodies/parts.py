@@ -365,9 +365,12 @@ def with_dimensions(body: Body, values: Mapping[str, float]) -> Body:
     if not moved:
         return body
     landmarks = replace(body.landmarks, points=points)
-    sets = {name: _moved_points(s, body.landmarks, landmarks) for name, s in body.keypoint_sets.items()}
+    keypoints, markers = (
+        {name: _moved_points(points, body.landmarks, landmarks) for name, points in sets.items()}
+        for sets in (body.keypoint_sets, body.marker_sets)
+    )
     return replace(
-        body, tree=body.tree.with_offsets(offsets), landmarks=landmarks, keypoint_sets=sets,
+        body, tree=body.tree.with_offsets(offsets), landmarks=landmarks, keypoint_sets=keypoints, marker_sets=markers,
         closures=tuple(closures.values()), dimensions=tuple(known.values()),
     )  # fmt: skip
 

@@ -21,7 +21,8 @@ from kinefit.sensors.base import Measurement
 from kinefit.sensors.points.markers import MarkerMeasurement, MarkerSensor
 from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.subject import fit as joint
-from kinefit.subject.parameters import PointOffsets, SegmentScales, place_spread
+from kinefit.subject.gear import Gear
+from kinefit.subject.parameters import PointOffsets, SegmentScales, World, place_spread
 from kinefit.subject.subject import SubjectFit
 
 Progress = Callable[[str, int, int], None]
@@ -88,7 +89,7 @@ def fit_marker_subject(
     height: float | None = None,
     progress: Progress | None = None,
 ) -> MarkerSubject:
-    """Fit body size and marker offsets jointly to static or moving trials of one subject.
+    """Fit body size, marker offsets and unknown gear jointly to static or moving trials of one subject.
 
     If a trial moves a joint, its centre (and the knee's axis) follows from the markers of both segments. Otherwise it
     follows from the landmarks under the markers and from proportions, so a static trial gives scaling by landmarks.
@@ -130,9 +131,10 @@ def fit_marker_subject(
     known = height / body.stature if height and body.stature else None
     size = known if known is not None else first_size(body, placed, x)
     generic = replace(body, marker_sets={placed.name: placed.points}, surfaces=(), skin=None)
-    lengths, groups = SegmentScales(generic, known, size), len(body.scale_groups)
+    lengths, groups, gear = SegmentScales(generic, known, size), len(body.scale_groups), Gear(generic)
+    own = slice(groups + len(gear.names), None)  # offsets of markers, which sit on gear that is in its place
     sigma = floor = np.hypot(_MIN_SIGMA, _SLIDING_SHARE * placed.spread)
-    theta = np.concatenate([lengths.mean, np.zeros(3 * len(placed.points))])
+    theta = np.concatenate([lengths.mean, gear.mean, np.zeros(3 * len(placed.points))])
     fitted, spread_factor = generic.scaled(np.exp(lengths.mean)), 1.0
     for round_ in range(_CALIBRATION_ROUNDS):
         looseness = np.hypot(sigma, placed.spread) if round_ == 0 else sigma
@@ -141,28 +143,29 @@ def fit_marker_subject(
         parts = [a + _spread_frames(visible[a:b], angles[a:b], good[a:b], count) for a, b in pairwise(starts)]
         chosen = np.concatenate(parts)
         if round_ == 0:
-            theta[groups:] = _shifts(fitted, fitted.markers(placed.name), roots[good], angles[good], x[good]).ravel()
-        shifts = np.linalg.norm(theta[groups:].reshape(-1, 3), axis=1)
+            theta[own] = _shifts(fitted, fitted.markers(placed.name), roots[good], angles[good], x[good]).ravel()
+        shifts = np.linalg.norm(theta[own].reshape(-1, 3), axis=1)
         # A marker far from the set's place in all frames may have been placed there.
         spread = np.maximum(spread_factor * placed.spread, _MIN_SPREAD_SHARE * shifts)
         found = joint.fit_subject(
             generic, Rig(()), [_measured(placed, x[f], sigma) for f in chosen],
-            [BodyState(roots[f], angles[f]) for f in chosen], (lengths, PointOffsets(generic, placed.name, spread)),
-            start=theta, reach=joint.REACH[-1:], rounds=1, looks=_INDEPENDENT_FRAMES * sum(len(p) > 0 for p in parts),
+            [BodyState(roots[f], angles[f]) for f in chosen],
+            (lengths, *[gear] * bool(gear.names), PointOffsets(generic, placed.name, spread)), start=theta,
+            reach=joint.REACH[-1:], rounds=1, looks=_INDEPENDENT_FRAMES * sum(len(p) > 0 for p in parts),
         )  # fmt: skip
         theta, fitted = found.mean, found.body
         prior_spread = np.repeat(placed.spread, 3)
-        variance = np.square(found.std[groups:] / prior_spread)
-        spread_factor = place_spread(theta[groups:] / prior_spread, variance, spread_factor, 1.0)
+        variance = np.square(found.std[own] / prior_spread)
+        spread_factor = place_spread(theta[own] / prior_spread, variance, spread_factor, 1.0)
         residuals = _residuals(found, placed.name, x[chosen])
         sigma = np.clip(_noise(residuals, len(chosen), body.tree.n_dofs), floor, _MAX_SIGMA)
         progress("marker offsets", round_ + 1, _CALIBRATION_ROUNDS)
     inlier, scales = residuals < 5.0 * 1.7 * sigma, np.exp(theta[:groups])
-    whole = body.scaled(scales)
+    whole = gear.apply(World(body.scaled(scales), Rig(())), theta[groups : own.start]).body
     named = {**whole.marker_sets, **fitted.marker_sets}
     return MarkerSubject(
         replace(whole, marker_sets=named), placed.name, scales, scales * found.std[:groups], sigma,
-        np.linalg.norm(theta[groups:].reshape(-1, 3), axis=1), float(np.sqrt(np.mean(residuals[inlier] ** 2))),
+        np.linalg.norm(theta[own].reshape(-1, 3), axis=1), float(np.sqrt(np.mean(residuals[inlier] ** 2))),
         len(chosen), found,
     )  # fmt: skip
 

@@ -31,6 +31,8 @@ CLOSED = 1e-9
 
 _MIN_RESIDUAL = 1e-13  # [m, rad] below which no further step is taken; far from the world's origin rounding is larger
 _MIN_SINGULAR_RATIO = 1e-7  # to the largest singular value of A: below it an equation is redundant
+_MIN_SELF_STRESS = 1e-7  # of a unit set of forces that balances itself: a force or torque with less is determined
+_MAX_UNBALANCED = 1e-6  # of the largest load
 _MAX_PROJECTION_STEPS = 30  # Newton steps onto the equations
 _MAX_LIMIT_ROUNDS = 6  # of stopping coordinates at limits that a step would exceed
 
@@ -201,23 +203,39 @@ def on_null_space(covariance: NDArray, A: NDArray) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class ClosureForces:
-    """Forces in the closures of a body in static equilibrium.
+    """Forces in the closures of a body in static equilibrium, as far as the equilibrium determines them.
+
+    Gear that people clamp, such as a board between two boots, carries forces that active joints balance without any
+    load: such forces and torques are named in `undetermined` and have no value. `str()` gives a table.
 
     Parameters
     ----------
-    names : (m,) of the equations: closure and direction
-    force : (m,) [N], of rotations [N m]: on each closure's `point`, in the frame of its `to` (or of the world); the
-        opposite force acts on the other side
-    determined : (m,) bool, whether the equilibrium determines the force; False for gear clamped against itself
-    torque : (n,) [N m, N] of the active coordinates; 0 for passive ones
+    forces : {closure and direction: [N], of rotations [N m]} on each closure's `point`, in the frame of its `to` (or of
+        the world); the opposite force acts on the other side
+    torques : {coordinate: [N m], of slides [N]} of the active coordinates
+    undetermined : names of equations and active coordinates that the equilibrium does not determine
     unbalanced : (n,) [N, N m] load on the root and the passive coordinates that no closure balances; 0 in equilibrium
+    unsupported : passive coordinates whose load nothing balances: there is no equilibrium, and nothing is determined
     """
 
-    names: tuple[str, ...]
-    force: NDArray
-    determined: NDArray
-    torque: NDArray
+    forces: dict[str, float]
+    torques: dict[str, float]
+    undetermined: tuple[str, ...]
     unbalanced: NDArray
+    unsupported: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        if self.unsupported:
+            stuck = ", ".join(self.unsupported)
+            return f"no equilibrium: nothing balances the load on {stuck}. Name what does in `active`."
+        lines = [f"{name}: {value:.1f} N{' m' * (' about ' in name)}" for name, value in self.forces.items()]
+        lines += [f"torque of {name}: {value:.1f} N m" for name, value in self.torques.items()]
+        if self.undetermined:
+            lines.append(
+                f"not determined: {', '.join(self.undetermined)}. Active joints can press these against each other "
+                "without any load. Name fewer joints in `active`, those of one limb for instance, to determine more."
+            )
+        return "\n".join(lines)
 
 
 def load_of(body: Body, state: BodyState, points: PointSet, forces: ArrayLike) -> NDArray:
@@ -265,8 +283,15 @@ def closure_forces(
     rank = int(np.sum(s > _MIN_SINGULAR_RATIO * max(float(s.max(initial=0.0)), 1e-12)))
     force = -Vt[:rank].T @ ((U[:, :rank].T @ load[~held]) / s[:rank])
     balance = load + A.T @ force
-    names = tuple(f"{c.name} {row}" for c in body.closures for row in c.row_names)
+    names = [f"{c.name} {row}" for c in body.closures for row in c.row_names]
+    joints = {name: 6 + tree.coordinate(name) for name in active}
+    among = np.concatenate([Vt[rank:], Vt[rank:] @ A[:, list(joints.values())]], axis=1)  # in balance without a load
+    free = [k for k, size in zip((*names, *joints), np.abs(among).max(axis=0, initial=0.0)) if size > _MIN_SELF_STRESS]
+    off = ~held & (np.abs(balance) > _MAX_UNBALANCED * np.abs(load).max())
+    unsupported = tuple(name for k, name in enumerate(tree.coordinates) if off[6 + k])
+    free = [*names, *joints] if unsupported else free
     return ClosureForces(
-        names, force, np.abs(Vt[rank:]).max(axis=0, initial=0.0) < _MIN_SINGULAR_RATIO, np.where(held, -balance, 0.0),
-        np.where(held, 0.0, balance),
+        {name: float(f) for name, f in zip(names, force) if name not in free},
+        {name: -float(balance[k]) for name, k in joints.items() if name not in free}, tuple(free),
+        np.where(held, 0.0, balance), unsupported,
     )  # fmt: skip

@@ -130,18 +130,17 @@ def _fitted(
         offsets = [
             PointOffsets(body, name, spread[(own < 1.0).astype(int)] * own) for name, own in zip(sets, shares)
         ]
-        parameters: list[Parameters] = [lengths, *offsets]
-        before = sum(len(kind.names) for kind in parameters)
-        if k and gear.names:  # gear starts from poses of the first round
-            parameters.append(gear)
+        has_gear = k > 0 and bool(gear.names)  # gear starts from poses of the first round
+        parameters: list[Parameters] = [lengths, *[gear] * has_gear, *offsets]
         of_body = sum(len(kind.names) for kind in parameters)
+        before = of_body - sum(len(kind.names) for kind in offsets)
         if cameras is not None:
             parameters.append(cameras.tighter(excess_of**-0.5))
         if start is None:
             of_points = [kind.mean for kind in parameters[1:] if not isinstance(kind, CameraExtrinsics)]
             start = np.concatenate([np.log(scales), *of_points, np.zeros(0 if cameras is None else len(cameras.names))])
-        elif of_body > before:
-            start = np.concatenate([start[:before], gear.start(states), start[before:]])
+        elif has_gear and k == 1:
+            start = np.concatenate([start[: len(scales)], gear.start(states), start[len(scales) :]])
         found = joint.fit_subject(
             bare, channels.rig, steps, states, parameters, start=start, rounds=1, looks=len(steps),
             posture=_POSTURE_PRIOR_SHARE,
@@ -156,7 +155,7 @@ def _fitted(
         covariance = inverse(prior + found.information / excess_of)
         moved, share = found.mean - found.prior.mean, np.full(len(prior), np.nan)
         of_points = [kind.values_of(own[:, None].repeat(3, axis=1)) for kind, own in zip(offsets, shares)]
-        share[len(lengths.names) : before] = np.concatenate(of_points)
+        share[before:of_body] = np.concatenate(of_points)
         for short, of in enumerate((share == 1.0, share < 1.0)):
             open_to = np.flatnonzero(of & np.isclose(np.diag(prior) * share**2, spread[short] ** -2))
             offset, variance = moved[open_to] / share[open_to], np.diag(covariance)[open_to] / share[open_to] ** 2
@@ -171,7 +170,8 @@ def _fitted(
     found = replace(found, body=Worlds(prior_world, parameters).at(found.mean).body, prior_world=prior_world)
     if cameras is not None:
         found = replace(found, parameters=(*parameters[:-1], cameras))
-    wider = np.sqrt(np.where(np.arange(len(covariance)) < of_body, _SHAPE_VARIANCE_FACTOR, 1.0))
+    wider = np.ones(len(covariance))  # gear has the prior of its file: its standard deviation is not above that
+    wider[: len(scales)] = wider[before:of_body] = _SHAPE_VARIANCE_FACTOR**0.5
     return found, wider[:, None] * covariance * wider, bias
 
 

@@ -85,6 +85,9 @@ class SizedPerson:
         """The same with the subject that labelled markers gave, on a body of its size."""
         subject = Subject(body, found.scales, length_share=found.scale_std / found.scales)
         person = replace(self, subject=subject, joint=(*self.joint, found.fit))
+        fit = found.fit
+        if gear := Gear(fit.prior_world.body).names:
+            person = person.reporting(shape={name: value for name, value in fit.record().items() if name in gear})
         return person.reporting(markers={"rms_m": round(found.rms, 4), "frames": found.frames})
 
 
@@ -125,7 +128,8 @@ def fitted_to_person(
             problem = f"{what} needs keypoints of two cameras, which this recording does not have"
             raise ObservationError(problem, remedy=f"Leave out {what}, or add [[keypoints]] of two cameras.")
     person = SizedPerson(recording, Subject.as_is(body), recording.start, calibrated=recording.rig)
-    unknown = any(s.unknowns for s in recording.sensors) or has_unknown_gear(body if subject is None else subject.body)
+    of_sensors = any(s.unknowns for s in recording.sensors)
+    unknown = of_sensors or has_unknown_gear(body if subject is None else subject.body)
     if subject is not None:
         person = replace(person, subject=subject)
         return _by_all(person, body, settings, progress, size=False) if unknown else person
@@ -145,7 +149,7 @@ def fitted_to_person(
         person = _with_depth_cameras(person, settings)
     elif recording.markers and recording.markers[0].marker_set:
         person = _by_markers(person, height, progress)
-        if recording.markers_alone and not unknown:
+        if recording.markers_alone and not of_sensors:
             return person
         person = replace(person, joint=())
     else:
@@ -292,7 +296,8 @@ def _by_all(
     points = None
     if size:
         points = of_points(
-            r, generic, person.subject, height, trial, calibrated=person.calibrated, cameras=settings.camera_errors
+            r, generic, person.subject, height, trial, calibrated=person.calibrated, cameras=settings.camera_errors,
+            states=states,
         )  # fmt: skip
     if points is not None:
         seen, stated = [[m for m in several if m.settled] for several in steps], points

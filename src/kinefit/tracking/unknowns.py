@@ -81,9 +81,9 @@ class Unknowns:
 
 def of_points(
     recording: Recording, generic: Body, subject: Subject, height: float | None, trial: Subject | None, *,
-    calibrated: Rig | None = None, cameras: CameraErrors | None = None,
+    calibrated: Rig | None = None, cameras: CameraErrors | None = None, states: Sequence[BodyState] = (),
 ) -> Unknowns | None:  # fmt: skip
-    """Lengths, places of keypoints, markers and cameras, where there are markers; else the keypoints' fit is that.
+    """Lengths, gear, offsets of points, and cameras, where there are markers; else the keypoints' fit has them.
 
     They have the generic body's prior: the fit from one kind of sensors that came first says where to begin, and is not
     counted again.
@@ -93,6 +93,7 @@ def of_points(
     generic : the body before any fit
     subject : what the first fit found
     height, trial : as of `track`
+    states : poses of the body, which tell where gear begins
     calibrated : Rig of the calibration, from which the recording's may have been moved; default: it is the recording's
     cameras : how far they may be from there; default: exact
     """
@@ -109,7 +110,7 @@ def of_points(
     if trial is not None and trial.covariance is not None:
         count = len(trial.scales)
         lengths = KnownLengths(generic, scales=trial.scales, covariance=trial.covariance[:count, :count])
-    found: list[tuple[Parameters, NDArray]] = [(lengths, np.log(subject.scales))]
+    found: list[tuple[Parameters, NDArray]] = [(lengths, np.log(subject.scales)), *_gear(generic, states)]
     found += list(_keypoint_offsets(generic, subject).values())
     if recording.alone is not None:
         one = PointOffsets(generic, recording.keypoints[0].keypoint_set, _ONE_CAMERA)
@@ -162,13 +163,17 @@ def of_all(
         found.append((_size_by_network(body, recording), np.zeros(len(body.scale_groups))))
     if size and surfaces:
         found += [(shape, shape.mean) for shape in shape_of(body)]
-    gear = Gear(body)
-    if gear.names:
-        found.append((gear, gear.start(states)))
+    found += _gear(body, states)
     unknown = OwnUnknowns.of(recording.sensors)
     if unknown.names:
         found.append((unknown, _start_of(unknown, World(body, recording.rig), steps, states)))
     return _together(World(body, recording.rig), found)
+
+
+def _gear(body: Body, states: Sequence[BodyState]) -> list[tuple[Parameters, NDArray]]:
+    """The unknown gear of a body and where its fit begins; none where all is known."""
+    gear = Gear(body)
+    return [(gear, gear.start(states))] if gear.names else []
 
 
 def _start_of(

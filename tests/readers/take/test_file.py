@@ -122,8 +122,13 @@ def load(folder, text):
 
 def test_paths_are_relative_to_the_take(small, monkeypatch):
     monkeypatch.chdir(small.parent)
+    worn = '[[markers]]\nfile = "m.trc"\nset = "worn.toml"\n[[markers]]\nfile = "n.trc"\nset = "CMU_41"\n'
+    path = written(small, take_text(head='rate = 50\nbody = "own.toml"') + worn)
+    for name in ("own.toml", "worn.toml", "m.trc", "n.trc"):
+        written(small, "", name)
+    take = read_take(path.relative_to(small.parent))
+    assert [entry.set for entry in take.markers] == [str(small / "worn.toml"), "CMU_41"]
     path = written(small, take_text(head='rate = 50\nbody = "own.toml"'))
-    written(small, "", "own.toml")
     take = read_take(path.relative_to(small.parent))
     assert take.calibration.file == small / "calibration.toml"
     assert take.body == str(small / "own.toml")

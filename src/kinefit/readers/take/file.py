@@ -68,6 +68,10 @@ def read_take(path: str | PathLike[str]) -> Take:
     head["name"] = head.get("name") or printable(path.stem)
     if isinstance(body := head.get("body"), str) and body.endswith((".toml", ".npz")):
         head["body"] = str(_there(path.parent, body))
+    marked = raw.get("markers")
+    for row in marked if isinstance(marked, list) else ():
+        if isinstance(row, dict) and str(row.get("set", "")).endswith(".toml"):
+            row["set"] = str(_there(path.parent, row["set"]))
     of_kinds = {table: entry_class(table) for table in KINDS.names() if table in raw}
     head["sensors"] = {t: _converted({t: raw.pop(t)}, tuple[of_kinds[t], ...], path, t) for t in of_kinds}  # type: ignore
     take: Take = _converted(head | {ATTRIBUTES.get(table, table): rows for table, rows in raw.items()}, Take, path)
