@@ -52,6 +52,7 @@ MOTION_CORRELATION_TIME = 0.1
 _BY_MEASUREMENTS = 0.8  # of a smoothed fit's variance, by errors of measurements, the rest by accelerations. 0.78 to
 # 0.83 by the spectrum of a motion prior that averages 0.2 s, at 30 to 100 Hz, with accelerations of 0.05 to 0.3 s
 _KEPT_AT_ONCE = 1000  # key frames, of which lasting errors fill 11 kB each
+_LARGEST = 6e4  # [m, rad] of what is kept, which 16 bits hold: of what nothing observes
 _DIRECTIONS = 120  # of lasting errors that are kept. The sigma of differences on the balancing trial is within 0.3 %
 # of that with all; with 60 within 6 %, with 20 within 43 %
 _NOISE_STRETCHES = 6  # of a long take, from which the detectors' noise is estimated: 12,000 frames are enough
@@ -214,8 +215,8 @@ class _KeyFrames:
         """Keep those of a frame, if it is a key frame."""
         k = int(np.searchsorted(self.errors.frames, frame))
         if k < len(self.errors.frames) and self.errors.frames[k] == frame:
-            self.errors.constant[k] = product(_with_shapes(errors, shapes, frame), self.constant)
-            self.errors.drift[k] = product(errors.drift, self.drift)
+            constant, drift = product(_with_shapes(errors, shapes, frame), self.constant), product(errors.drift, self.drift)
+            self.errors.constant[k], self.errors.drift[k] = (np.clip(v, -_LARGEST, _LARGEST) for v in (constant, drift))
             if k % _KEPT_AT_ONCE == _KEPT_AT_ONCE - 1:
                 release(self.errors.constant, self.errors.drift)
 
