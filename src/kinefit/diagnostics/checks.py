@@ -12,12 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, load_body
-from kinefit.diagnostics import cameras, frozen, images, lenient, mistakes, person, rig, timing, views
+from kinefit.diagnostics import (
+    cameras,
+    clock_course,
+    frozen,
+    images,
+    kicked,
+    lenient,
+    mistakes,
+    person,
+    rig,
+    timing,
+    views,
+)
 from kinefit.diagnostics.cameras import CameraBias
 from kinefit.diagnostics.rig import CameraCoverage
 from kinefit.diagnostics.sensors import SensorAlignment
 from kinefit.diagnostics.timing import TimeOffsets
-from kinefit.diagnostics.views import KeypointViews
+from kinefit.diagnostics.views import KeypointViews, make_views, with_sides_right
 from kinefit.errors import KinefitError
 from kinefit.findings import Finding, faults_of, ranked
 from kinefit.geometry.camera import Rig
@@ -36,6 +48,7 @@ QUICK_S = 0.5
 _UNKNOWN: Any = None  # what no check has found out yet
 _SAMPLE_FRAMES = 240  # spread over the recording, for properties that are constant over time
 _QUICK_FRAMES = 150  # consecutive frames in which a quick check compares clocks
+_COURSE_FRAMES = 360  # consecutive frames in which it looks for clocks that change
 _QUICK_INTERVALS = 5  # candidates for these, spread over the recording: the one with most motion is used
 _MAX_JUMP_PX = 100.0  # in five frames; a larger one is to another person
 _STATED_IMAGES = ("scaled", "letterboxed")  # statements of the take that one image of the video can contradict
@@ -274,6 +287,19 @@ def _unseen(c: Checked) -> list[Finding]:
     return findings
 
 
+def _clock_course(c: Checked) -> list[Finding]:
+    """Clocks that change within the take; the views are put in step for the checks that follow."""
+    views, first = c.moving, c.observations.frames[0] if c.observations else 0
+    if c.quick and len(views) < min(map(len, c.keypoints)):
+        views = make_views(c.rig, [k.rows(slice(0, _COURSE_FRAMES), k.time_offset) for k in c.keypoints])
+    views = views.select(c.views.rig.names)
+    course = clock_course.clock_course(with_sides_right(views))
+    if course is None:
+        return []
+    c.views = c.moving = timing.shifted(views, course.of(views.rig.names))
+    return [course.finding(views.rig, views.rate, first)]
+
+
 def _groups(c: Checked) -> list[Finding]:
     found = timing.group_findings(c.rig, c.keypoints, c.observations.frames[0] if c.observations else 0)
     c.sound = not found
@@ -281,8 +307,28 @@ def _groups(c: Checked) -> list[Finding]:
 
 
 def _strangers(c: Checked) -> list[Finding]:
-    """Cameras that agree with no other once all are synchronised, which are left out, or what explains them."""
+    """Cameras that agree with no other once all are synchronised, which are left out, or what explains them.
+
+    Cameras that moved during the recording are named first, and lose what they saw in their other pose.
+    """
     _synchronise(c, c.views.rig.names)
+    moved = _moved_within(c)
+    return [*moved, *_always_strange(c)]
+
+
+def _moved_within(c: Checked) -> list[Finding]:
+    if c.quick and c.frames_late:  # the views are of an interval
+        return []
+    every = -(-min(map(len, c.keypoints)) // len(c.views)) if c.quick else 1
+    first = c.observations.frames[0] if c.observations else 0
+    found, seen = kicked.kick_findings(c.views, first + every * np.arange(len(c.views)))
+    if found:
+        c.views, c.moving = seen, c.moving if c.quick else seen
+        _synchronise(c, c.views.rig.names)
+    return found
+
+
+def _always_strange(c: Checked) -> list[Finding]:
     found = cameras.stranger_findings(c.sampled)
     if found:  # a mistake is certain: smaller improvements suffice
         gross = cameras.distortion_findings(c.sampled)
@@ -320,7 +366,9 @@ def _scale(c: Checked) -> list[Finding]:
 
 def _clocks(c: Checked) -> list[Finding]:
     offsets = {entry.name: entry.time_offset for entry in c.take.cameras} if c.take else {}
-    return timing.time_findings(c.times, offsets, timing.fast_pixels(c.stepped), confirmed=bool(c.frames_late))
+    found = timing.time_findings(c.times, offsets, timing.fast_pixels(c.stepped), confirmed=bool(c.frames_late))
+    known = _named(c, "rate", "kicked")  # a drift, or too few frames
+    return [f for f in found if f.severity in ("fault", "good") or not f.cameras or not {*f.cameras} <= known]
 
 
 def _biases(c: Checked) -> list[Finding]:
@@ -332,7 +380,12 @@ def _biases(c: Checked) -> list[Finding]:
 
 def _coverage(c: Checked) -> list[Finding]:
     c.coverage = rig.coverage(c.sampled, c.x)
-    return rig.coverage_findings(c.coverage)
+    return rig.coverage_findings([one for one in c.coverage if one.camera not in _named(c, "kicked", "frozen")])
+
+
+def _named(c: Checked, *kinds: str) -> set[str]:
+    """Cameras that findings of some kinds are about."""
+    return {name for found in c.findings if found.kind in kinds for name in found.cameras}
 
 
 _VIEWS = ("sound", "views")
@@ -370,10 +423,14 @@ CHECKS = (
         "A camera that was moved far may look like a wrong sign or focal length, and a mirrored world like its images.",
     ),
     Check("person in each camera", _unseen, _VIEWS, alike="A detector that fails on a whole video looks the same."),
+    Check(
+        "course of the clocks", _clock_course, _VIEWS, 0.4,
+        "A camera that follows another person from then on, and frames that were cut out look the same.",
+    ),
     Check("groups", _groups, _VIEWS, 0.1, "Cameras that follow different people in one part look the same."),
     Check(
-        "other cameras", _strangers, _VIEWS, 0.4,
-        "The calibration or the video of another camera, and keypoints of another person look the same.",
+        "other cameras", _strangers, _VIEWS, 0.5,
+        "The calibration or the video of another camera, a zoom, and keypoints of another person look the same.",
     ),
     Check("scale", _scale, _VIEWS, alike="All focal lengths too long or too short, and a child look the same."),
     Check(

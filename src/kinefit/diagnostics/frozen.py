@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -113,7 +114,7 @@ def _depth_runs(video: DepthVideo) -> list[tuple[int, int]]:
         return bool(np.sum(a > 0.0) >= _MIN_PIXELS and np.array_equal(a, video.frame(j).depth))
 
     tested = np.arange(0, len(video), step)
-    equal = np.array([same(int(i), int(j)) for i, j in zip(tested[:-1], tested[1:])], bool)
+    equal = np.array([same(int(i), int(j)) for i, j in pairwise(tested)], bool)
     out = []
     for a, b in runs_of(equal) if not equal.all() else ():
         first, last = int(tested[a]), int(tested[b])
