@@ -130,7 +130,8 @@ def _best_course(
     least, without = float(costs.min(axis=2).mean()), float(constant.mean())
     if without < _MIN_EXCESS * least:
         return None
-    best, chosen = without - _MIN_EXPLAINED * (without - least), ((0,), -1)
+    chosen: tuple[tuple[int, ...], int] = (0,), -1
+    best = without - _MIN_EXPLAINED * (without - least)
     for group in _groups(len(views.rig)):
         first, second = (np.isin([pair[k] for pair in pairs], group) for k in (0, 1))
         total = np.where(first == second, constant, np.where(first, forward, back)).mean(axis=1)
