@@ -104,7 +104,12 @@ def mistake_findings(views: KeypointViews, take_file: str = "the take", *, lenie
 
 
 def focal_findings(views: KeypointViews) -> list[Finding]:
-    """Find focal lengths of another image size, after the person's size was found implausible."""
+    """Find focal lengths of another image size, after the person's size was found implausible.
+
+    None of two cameras: a wrong pose of one of them looks the same.
+    """
+    if len(views.rig) < 3:
+        return []
     uv = sample(views)
     trials = _of_all(_focal_lengths(), views.rig, uv)
     mistake = _best(trials, disagreement_share(views.rig, uv), lenient=True)
