@@ -93,13 +93,13 @@ def _runs(x: NDArray, rate: float) -> list[tuple[int, int]]:
     least = max(_MIN_FROZEN_S * rate, _MIN_FROZEN_FRAMES)
     both = known[1:] & known[:-1]
     moving = np.where(both & ~equal[:, None], step, np.nan)
-    usual = moving[np.isfinite(moving)]
-    if not len(usual) or np.mean(changed[~equal][both[~equal]]) < _MIN_CHANGED_SHARE:
+    steps = moving[np.isfinite(moving)]
+    if not len(steps) or np.mean(changed[~equal][both[~equal]]) < _MIN_CHANGED_SHARE:
         return []
 
     def jumps(at: int) -> bool:
         own = moving[at][np.isfinite(moving[at])] if 0 <= at < len(moving) else np.zeros(0)
-        return len(own) > 0 and float(np.median(own)) > _MIN_JUMP * float(np.median(usual))
+        return len(own) > 0 and float(np.median(own)) > _MIN_JUMP * float(np.median(steps))
 
     runs = [(a, b) for a, b in runs_of(equal) if b - a >= least and (jumps(a - 1) or jumps(b))]
     return [(a + 1, b + 1) for a, b in runs]
@@ -109,12 +109,15 @@ def _depth_runs(video: DepthVideo) -> list[tuple[int, int]]:
     """(start, stop) of the depth images that repeat the image before `start`."""
     step = max(int(video.rate / _SEARCH_HZ), 1)
 
+    def alike(a: NDArray, b: NDArray) -> bool:
+        return bool(np.sum(a > 0.0) >= _MIN_PIXELS and np.array_equal(a, b))
+
     def same(i: int, j: int) -> bool:
-        a = video.frame(i).depth
-        return bool(np.sum(a > 0.0) >= _MIN_PIXELS and np.array_equal(a, video.frame(j).depth))
+        return alike(video.frame(i).depth, video.frame(j).depth)
 
     tested = np.arange(0, len(video), step)
-    equal = np.array([same(int(i), int(j)) for i, j in pairwise(tested)], bool)
+    images = (video.frame(int(i)).depth for i in tested)  # each is decoded once
+    equal = np.array([alike(a, b) for a, b in pairwise(images)], bool)
     out = []
     for a, b in runs_of(equal) if not equal.all() else ():
         first, last = int(tested[a]), int(tested[b])
