@@ -115,7 +115,7 @@ def faults(s: Scene, seed: int) -> Iterator[Fault]:
     own, both = frozenset({name}), frozenset({name, s.told.names[other]})
     for k, axis in enumerate("xyz"):
         yield Fault(f"turned about {axis}", s.inputs(told=_turned(s.told, name, k, 3.0)), own,
-                    r"moved or rotated|disagrees with")  # fmt: skip
+                    r"rotated|disagrees with")  # fmt: skip
     points = np.stack([p[r] for p, r in zip(s.seen, s.rows())])
     kicked, at = points.copy(), half + 10
     kicked[c, at:] = s.kicked[c, s.rows()[c, at:]]

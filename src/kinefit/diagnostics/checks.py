@@ -12,19 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, load_body
-from kinefit.diagnostics import (
-    cameras,
-    clock_course,
-    frozen,
-    images,
-    kicked,
-    lenient,
-    mistakes,
-    person,
-    rig,
-    timing,
-    views,
-)
+from kinefit.diagnostics import cameras, changes, frozen, images, lenient, mistakes, person, rig, timing, views
 from kinefit.diagnostics.cameras import CameraBias
 from kinefit.diagnostics.rig import CameraCoverage
 from kinefit.diagnostics.sensors import SensorAlignment
@@ -289,46 +277,40 @@ def _unseen(c: Checked) -> list[Finding]:
 
 def _clock_course(c: Checked) -> list[Finding]:
     """Clocks that change within the take; the views are put in step for the checks that follow."""
-    views, first = c.moving, c.observations.frames[0] if c.observations else 0
-    if c.quick and len(views) < min(map(len, c.keypoints)):
-        views = make_views(c.rig, [k.rows(slice(0, _COURSE_FRAMES), k.time_offset) for k in c.keypoints])
-    views = views.select(c.views.rig.names)
-    course = clock_course.clock_course(with_sides_right(views))
-    if course is None:
-        return []
-    c.views = c.moving = timing.shifted(views, course.of(views.rig.names))
-    return [course.finding(views.rig, views.rate, first)]
+    moving = c.moving
+    if c.quick and len(moving) < min(map(len, c.keypoints)):
+        moving = make_views(c.rig, [k.rows(slice(0, _COURSE_FRAMES), k.time_offset) for k in c.keypoints])
+    found, seen = changes.clock_findings(with_sides_right(moving.select(c.views.rig.names)), _first_frame(c))
+    if found:
+        c.views = c.moving = seen
+    return found
+
+
+def _first_frame(c: Checked) -> int:
+    return c.observations.frames[0] if c.observations else 0
 
 
 def _groups(c: Checked) -> list[Finding]:
-    found = timing.group_findings(c.rig, c.keypoints, c.observations.frames[0] if c.observations else 0)
+    found = timing.group_findings(c.rig, c.keypoints, _first_frame(c))
     c.sound = not found
     return found
 
 
-def _strangers(c: Checked) -> list[Finding]:
-    """Cameras that agree with no other once all are synchronised, which are left out, or what explains them.
-
-    Cameras that moved during the recording are named first, and lose what they saw in their other pose.
-    """
-    _synchronise(c, c.views.rig.names)
-    moved = _moved_within(c)
-    return [*moved, *_always_strange(c)]
-
-
 def _moved_within(c: Checked) -> list[Finding]:
+    """Cameras that moved during the recording, which lose what they saw in their other pose."""
+    _synchronise(c, c.views.rig.names)
     if c.quick and c.frames_late:  # the views are of an interval
         return []
     every = -(-min(map(len, c.keypoints)) // len(c.views)) if c.quick else 1
-    first = c.observations.frames[0] if c.observations else 0
-    found, seen = kicked.kick_findings(c.views, first + every * np.arange(len(c.views)))
+    found, seen = changes.move_findings(c.views, _first_frame(c) + every * np.arange(len(c.views)))
     if found:
         c.views, c.moving = seen, c.moving if c.quick else seen
         _synchronise(c, c.views.rig.names)
     return found
 
 
-def _always_strange(c: Checked) -> list[Finding]:
+def _strangers(c: Checked) -> list[Finding]:
+    """Cameras that agree with no other once all are synchronised, which are left out, or what explains them."""
     found = cameras.stranger_findings(c.sampled)
     if found:  # a mistake is certain: smaller improvements suffice
         gross = cameras.distortion_findings(c.sampled)
@@ -428,9 +410,10 @@ CHECKS = (
         "A camera that follows another person from then on, and frames that were cut out look the same.",
     ),
     Check("groups", _groups, _VIEWS, 0.1, "Cameras that follow different people in one part look the same."),
+    Check("cameras that move", _moved_within, _VIEWS, 0.4, "A zoom during the recording looks the same."),
     Check(
-        "other cameras", _strangers, _VIEWS, 0.5,
-        "The calibration or the video of another camera, a zoom, and keypoints of another person look the same.",
+        "other cameras", _strangers, _VIEWS, 0.4,
+        "The calibration or the video of another camera, and keypoints of another person look the same.",
     ),
     Check("scale", _scale, _VIEWS, alike="All focal lengths too long or too short, and a child look the same."),
     Check(

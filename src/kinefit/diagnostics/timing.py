@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.diagnostics.cameras import MIN_SIGMAS, without_points
-from kinefit.diagnostics.clock_course import MIN_FRAMES, pair_curves, shifted
+from kinefit.diagnostics.changes import MIN_FRAMES, pair_curves, shifted
 from kinefit.diagnostics.views import (
     KeypointViews,
     disagreement_share,
