@@ -39,6 +39,7 @@ _MIN_EXPLAINED = 0.5  # of this excess; a step within a window leaves up to half
 _MIN_GAIN = 1.04  # of the cost, of more cameras, to count instead of fewer
 _COMMON_RATES = (12.5, 15.0, 20.0, 24.0, 25.0, 30.0, 48.0, 50.0, 60.0, 90.0, 100.0, 120.0, 200.0, 240.0)  # [Hz]
 _MAX_RATE_ERROR = 0.015  # of an estimated rate
+_SPAN_STEP = 0.25  # [frames] over the take, between the drifts that are tried
 _MAX_DRIFT = 0.5  # of a frame in each frame: half the stated rate
 _MAX_ALL_PAIRS = 5  # cameras of which all pairs are compared in windows; of more, each with four others
 _MAX_SUBSET = 8  # cameras of which all groups are tried; of more, single ones
@@ -48,6 +49,7 @@ _MIN_PART_FRAMES = 8  # before and after a move
 _MIN_STEP_SHARE = 0.6  # of the squared deviation that one step explains, and of the step between its nearest frames: a
 # person who turns takes longer
 _NEAR_FRAMES = 10  # on each side
+_INLIER_PERCENTILES = 5, 95  # of the offsets of all frames
 _MAX_OTHER_STEP = 0.5  # of the others' offsets without the moved camera, to its own
 
 
@@ -78,9 +80,8 @@ def clock_findings(views: KeypointViews, first: int = 0) -> tuple[list[Finding],
 def _drift(views: KeypointViews, names: Sequence[str], slope: float) -> Finding:
     """Of a clock that drifts by `slope` [frames] in each frame."""
     true, others = views.rate / (1.0 + slope), listed(n for n in views.rig.names if n not in names)
-    near = min(_COMMON_RATES, key=lambda other: abs(other - true))
-    if abs(near / true - 1.0) < _MAX_RATE_ERROR < abs(near / views.rate - 1.0):
-        true = near
+    near = [r for r in _COMMON_RATES if abs(r / true - 1.0) < _MAX_RATE_ERROR < abs(r / views.rate - 1.0)]
+    true = near[0] if near else true
     text = f"The clock of {listed(names)} drifts by {60 * slope:+.2f} s a minute against {others}: its rate is "
     edits = tuple(Edit("keypoints", "rate", f"{true:.3f}", name) for name in names)
     return Finding("fault", "rate", f"{text}{true:.2f} Hz, not {views.rate:g} Hz.", tuple(names), edits=edits)
@@ -115,7 +116,7 @@ def _course(views: KeypointViews, windows: NDArray) -> tuple[Sequence[int], int,
     middles, reach = windows.mean(axis=1), costs.shape[2] // 2
     sizes = [s for s in range(-reach, reach + 1) if abs(s) >= _MIN_STEP]
     steps = [size * (np.arange(len(windows)) >= part) for part in range(1, len(windows)) for size in sizes]
-    spans = np.arange(-2 * reach, 2 * reach + 0.1, 0.5) / len(views)
+    spans = np.arange(-2 * reach, 2 * reach + 0.1, _SPAN_STEP) / len(views)
     slopes = spans[(np.abs(spans) * len(views) >= _MIN_STEP) & (np.abs(spans) <= _MAX_DRIFT)]
     slope = np.concatenate([np.zeros(len(steps) + 1), slopes])
     late = np.concatenate([[0.0 * middles], steps, np.outer(slopes, middles - middles.mean())])
@@ -133,18 +134,11 @@ def _course(views: KeypointViews, windows: NDArray) -> tuple[Sequence[int], int,
     if at == 0:
         return None
     size, frame = float(slope[at] or late[at][-1]), 0
-    if slope[at]:  # once more in step: within a window they hardly drift then
-        again = shifted(views, np.outer(size * np.arange(len(views)), np.isin(np.arange(cameras), group)))
-        pairs, costs = _window_costs(again, windows)
-        slopes = np.linspace(-2.0, 2.0, 81) / float(np.ptp(middles))
-        ways = _both_ways(costs, np.outer(slopes, middles - middles.mean()), slopes)
-        size = (1.0 + size) * (1.0 + float(slopes[np.argmin(_of_group(ways, pairs, group))])) - 1.0
-    else:
-        part = int(np.argmax(late[at] != 0.0))
-        others = ~np.isin(np.arange(cameras), group)  # which are shifted: frames are those of the group
-        frame = _first_after(views, -size * others, windows[part - 1][0], windows[part][-1])
+    if not slope[at]:
+        part, others = int(np.argmax(late[at] != 0.0)), ~np.isin(np.arange(cameras), group)
+        frame = _first_after(views, -size * others, windows[part - 1][0], windows[part][-1])  # in frames of the group
         if 2 * len(group) == cameras and size < 0:  # dropped frames are more frequent than repeated ones
-            group, size = tuple(np.setdiff1d(np.arange(cameras), group)), -size
+            group, size = tuple(np.flatnonzero(others)), -size
     return group, frame, size, (best, without)
 
 
@@ -257,9 +251,10 @@ def move_findings(views: KeypointViews, frames: NDArray) -> tuple[list[Finding],
     out, rest, uv = list[Finding](), views, views.uv.copy()
     while len(rest.rig) > 2:
         moves = [_largest_step(_offsets(rest, c)) for c in range(len(rest.rig))]
-        left = [_largest_of_others(rest, c, size) for c, (size, *_) in enumerate(moves)]
-        c = int(np.argmin(left))
-        if left[c] >= _MAX_OTHER_STEP:
+        without = [rest.without(c) if move[0] >= _MIN_MOVE_PX else None for c, move in enumerate(moves)]
+        left = [max(_largest_step(_offsets(v, k))[0] for k in range(len(v.rig))) if v else np.inf for v in without]
+        c = int(np.argmin([others / max(move[0], 1e-9) for others, move in zip(left, moves)]))
+        if left[c] >= _MAX_OTHER_STEP * moves[c][0]:
             break
         name, (size, at, off) = rest.rig.names[c], moves[c]
         edit = _longer_part(int(frames[0]), int(frames[at]), int(frames[-1]) + 1)
@@ -271,14 +266,6 @@ def move_findings(views: KeypointViews, frames: NDArray) -> tuple[list[Finding],
         uv[slice(at, None) if off[0] < off[1] else slice(0, at), :, views.rig.index(name)] = np.nan
         rest = rest.without(c)
     return out, replace(views, uv=uv)
-
-
-def _largest_of_others(views: KeypointViews, c: int, size: float) -> float:
-    """Largest step of the other cameras without a camera that has one of a size [px], as its share; else infinite."""
-    if size < _MIN_MOVE_PX:
-        return np.inf
-    rest = views.without(c)
-    return max(_largest_step(_offsets(rest, k))[0] for k in range(len(rest.rig))) / size
 
 
 def _offsets(views: KeypointViews, c: int) -> NDArray:
@@ -304,9 +291,7 @@ def _largest_step(offsets: NDArray) -> tuple[float, int, list[float]]:
     if len(at) < 2 * _MIN_PART_FRAMES:
         return 0.0, 0, [0.0, 0.0]
     raw, n = offsets[at], np.arange(1, len(at))
-    middle = np.median(raw, axis=0)
-    limit = 3.0 * np.median(np.linalg.norm(raw - middle, axis=1)) + _MIN_MOVE_PX
-    x = np.clip(raw - middle, -limit, limit)
+    x = np.clip(raw, *np.percentile(raw, _INLIER_PERCENTILES, axis=0))
     sums = np.cumsum(x, axis=0)
     apart = sums[:-1] / n[:, None] - (sums[-1] - sums[:-1]) / (len(x) - n)[:, None]
     gain = (n * (len(x) - n) / len(x)) * np.square(apart).sum(axis=1)

@@ -311,6 +311,11 @@ def _moved_within(c: Checked) -> list[Finding]:
 
 def _strangers(c: Checked) -> list[Finding]:
     """Cameras that agree with no other once all are synchronised, which are left out, or what explains them."""
+    turned, back = rig.turn_findings(c.sampled)
+    if turned and _sizes(c, back, views.meet(back)[0])[0][0].severity != "fault":  # else lenses are wrong
+        c.views, c.sampled = replace(c.views, rig=back.rig), back
+    else:
+        turned = []
     found = cameras.stranger_findings(c.sampled)
     if found:  # a mistake is certain: smaller improvements suffice
         gross = cameras.distortion_findings(c.sampled)
@@ -318,7 +323,7 @@ def _strangers(c: Checked) -> list[Finding]:
     strange = {camera for one in found for camera in one.cameras}
     c.sound = all(one.kind == "stranger" for one in found) and len(c.views.rig) > 1
     if not c.sound:
-        return found
+        return [*turned, *found]
     if strange:
         _synchronise(c, [name for name in c.views.rig.names if name not in strange])
     c.x, _ = views.meet(c.sampled)
@@ -326,7 +331,7 @@ def _strangers(c: Checked) -> list[Finding]:
     if not c.sound:
         remedy = "Point all at the same place."
         found = [*found, Finding("fault", "apart", "No two cameras see the same point.", remedy=remedy)]
-    return found
+    return [*turned, *found]
 
 
 def _synchronise(c: Checked, names: Sequence[str]) -> None:
@@ -337,13 +342,18 @@ def _synchronise(c: Checked, names: Sequence[str]) -> None:
 
 
 def _scale(c: Checked) -> list[Finding]:
-    sets = list(dict.fromkeys(k.keypoint_set for k in c.keypoints))
-    body = load_body(c.body) if isinstance(c.body, str) else c.body
-    ratios = person.bone_ratios(body, sets, c.sampled, c.x)
-    found = person.size_findings(person.stature(body, ratios), c.height)
+    found, ratios, sets = _sizes(c, c.sampled, c.x)
     if found[0].severity == "fault":
         found = person.order_findings(ratios, sets) or mistakes.focal_findings(c.sampled) or found
     return found
+
+
+def _sizes(c: Checked, seen: KeypointViews, x: NDArray) -> tuple[list[Finding], NDArray, list[str]]:
+    """Findings on the person's size, the ratios of bones to the body's that they are of, and the keypoint sets."""
+    sets = list(dict.fromkeys(k.keypoint_set for k in c.keypoints))
+    body = load_body(c.body) if isinstance(c.body, str) else c.body
+    ratios = person.bone_ratios(body, sets, seen, x)
+    return person.size_findings(person.stature(body, ratios), c.height), ratios, sets
 
 
 def _clocks(c: Checked) -> list[Finding]:
