@@ -195,7 +195,7 @@ def turn_findings(views: KeypointViews) -> tuple[list[Finding], KeypointViews]:
     text = f"A camera was rotated since the calibration: {which}. Turned back, the two cameras agree."
     confidence = "Certain: a rotation of the other camera explains the keypoints worse."
     if len(found) > 1:
-        confidence = "Likely; the images do not show which of the two. With a depth camera or markers, kinefit track does."
+        confidence = "Likely; the images do not show which of the two. With depth or markers, kinefit track does."
     remedy = "Calibrate again (kinefit calibrate people or board)."
     finding = Finding("fault", "moved", text, tuple(c.name for c in found), confidence, remedy)
     return [finding], replace(views, rig=views.rig.with_camera(found[0]))
