@@ -8,7 +8,7 @@ import pytest
 from kinefit.diagnostics.checks import check_keypoints
 from kinefit.findings import Edit
 from kinefit.geometry import se3
-from kinefit.simulation import movement, simulate_keypoints, squat_and_wave, studio_rig
+from kinefit.simulation import known_motion, movement, simulate_keypoints, squat_and_wave, studio_rig
 
 FINE, FRAMES = 5, 220  # frames of the fine motion are one of the recording
 MOTION = squat_and_wave(rate=30.0 * FINE, duration=10.0)
@@ -67,8 +67,7 @@ def test_constant_offsets_are_neither(rows):
 def looped(motion, frames, still=False):
     """Frames of a movement that begins anew when it ends, or of its first pose."""
     at = np.zeros(frames, int) if still else np.arange(frames) % len(motion)
-    zeros = {n: getattr(motion, n)[at] for n in ("quality", "joint_std", "dof_std")}
-    return replace(motion, Ts_world_root=motion.Ts_world_root[at], angles=motion.angles[at], **zeros)
+    return known_motion(motion.body, motion.rate, motion.Ts_world_root[at], motion.angles[at], up="y", name="looped")
 
 
 def alarms(motion, late):

@@ -37,6 +37,7 @@ _MIN_EXCESS = 1.08
 """Cost with constant offsets to that with an offset of its own in each window: up to 1.04 where they are constant."""
 _MIN_EXPLAINED = 0.5  # of this excess; a step within a window leaves up to half
 _MIN_GAIN = 1.04  # of the cost, of more cameras, to count instead of fewer
+_PERIOD_RATIO, _PERIOD_FRAMES = 1.03, 5  # of costs and least distance of steps that differ by periods of a movement
 _COMMON_RATES = (12.5, 15.0, 20.0, 24.0, 25.0, 30.0, 48.0, 50.0, 60.0, 90.0, 100.0, 120.0, 200.0, 240.0)  # [Hz]
 _MAX_RATE_ERROR = 0.015  # of an estimated rate
 _SPAN_STEP = 0.25  # [frames] over the take, between the drifts that are tried
@@ -133,6 +134,10 @@ def _course(views: KeypointViews, windows: NDArray) -> tuple[Sequence[int], int,
                 best, group, at = float(total.min()), some, int(np.argmin(total))
     if at == 0:
         return None
+    total, sizes = _of_group(ways, pairs, group), np.where(slope, np.inf, np.abs(late[:, -1]))
+    fits = (total <= _PERIOD_RATIO * best) & (sizes > 0.0) & (slope[at] == 0.0)
+    while (smaller := np.flatnonzero(fits & (sizes < sizes[at]) & (abs(late - late[at])[:, -1] > _PERIOD_FRAMES))).size:
+        at = int(smaller[np.argmin(total[smaller])])  # a movement that repeats itself: the nearest period
     size, frame = float(slope[at] or late[at][-1]), 0
     if not slope[at]:
         part, others = int(np.argmax(late[at] != 0.0)), ~np.isin(np.arange(cameras), group)

@@ -417,7 +417,8 @@ CHECKS = (
     Check("person in each camera", _unseen, _VIEWS, alike="A detector that fails on a whole video looks the same."),
     Check(
         "course of the clocks", _clock_course, _VIEWS, 0.4,
-        "A camera that follows another person from then on, and frames that were cut out look the same.",
+        "A camera that follows another person from then on, frames that were cut out, and, of a movement that repeats "
+        "itself, some periods more look the same.",
     ),
     Check("groups", _groups, _VIEWS, 0.1, "Cameras that follow different people in one part look the same."),
     Check("cameras that move", _moved_within, _VIEWS, 0.4, "A zoom during the recording looks the same."),
