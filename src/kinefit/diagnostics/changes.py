@@ -67,38 +67,37 @@ def clock_findings(views: KeypointViews, first: int = 0) -> tuple[list[Finding],
         if windows >= _MIN_WINDOWS and len(views.rig) > 1:
             course = _course(views, np.arange(windows * (length // windows)).reshape(windows, -1))
             if course is not None:
-                group, frame, size, costs = course
+                names, frame, size, costs = course
                 late = np.where(np.arange(len(views)) < frame, 0.0, size) if frame else size * np.arange(len(views))
-                names = [views.rig.names[c] for c in group]
                 finding = _drift(views, names, size) if not frame else _step(views, names, first, frame, size)
                 text = f"with it the rays of the cameras pass each other at {costs[0]:.1f} px, with constant offsets at"
                 text = f"Certain: {text} {costs[1]:.1f} px.{finding.confidence}"
-                moved = np.outer(late, np.isin(np.arange(len(views.rig)), group))
+                moved = np.outer(late, np.isin(views.rig.names, names))
                 return [replace(finding, confidence=text)], shifted(views, moved)
     return [], views
 
 
-def _drift(views: KeypointViews, names: Sequence[str], slope: float) -> Finding:
+def _drift(views: KeypointViews, names: tuple[str, ...], slope: float) -> Finding:
     """Of a clock that drifts by `slope` [frames] in each frame."""
     true, others = views.rate / (1.0 + slope), listed(n for n in views.rig.names if n not in names)
-    near = [r for r in _COMMON_RATES if abs(r / true - 1.0) < _MAX_RATE_ERROR < abs(r / views.rate - 1.0)]
-    true = near[0] if near else true
+    near = (r for r in _COMMON_RATES if abs(r / true - 1.0) < _MAX_RATE_ERROR < abs(r / views.rate - 1.0))
+    true = next(near, true)
     text = f"The clock of {listed(names)} drifts by {60 * slope:+.2f} s a minute against {others}: its rate is "
     edits = tuple(Edit("keypoints", "rate", f"{true:.3f}", name) for name in names)
-    return Finding("fault", "rate", f"{text}{true:.2f} Hz, not {views.rate:g} Hz.", tuple(names), edits=edits)
+    return Finding("fault", "rate", f"{text}{true:.2f} Hz, not {views.rate:g} Hz.", names, edits=edits)
 
 
-def _step(views: KeypointViews, names: Sequence[str], first: int, frame: int, size: float) -> Finding:
+def _step(views: KeypointViews, names: tuple[str, ...], first: int, frame: int, size: float) -> Finding:
     """Of clocks that jump at a frame by `size` [frames]."""
     others, at = listed(n for n in views.rig.names if n not in names), first + frame
     way, cause = ("later", "Frames were dropped") if size > 0 else ("earlier", "Frames were repeated")
     text = f"{listed(names)} {'are' if len(names) > 1 else 'is'} {abs(size):.0f} frames "
     text += f"({1e3 * abs(size) / views.rate:.0f} ms) {way} than {others} from frame {at} on, not before."
-    is_half = 2 * len(names) == len(views.rig)
-    more = f" Which half of the cameras is wrong cannot be seen: {others} may have the opposite." if is_half else ""
+    half = 2 * len(names) == len(views.rig)
+    more = f" Which half of the cameras is wrong cannot be seen: {others} may have the opposite." if half else ""
     edits = (_longer_part(first, at, first + len(views)),)
     remedy = f"{cause} there. Until it is corrected, write {in_words(edits)}."
-    return Finding("fault", "time", text, tuple(names), more, remedy, edits)
+    return Finding("fault", "time", text, names, more, remedy, edits)
 
 
 def _longer_part(first: int, at: int, last: int) -> Edit:
@@ -106,7 +105,7 @@ def _longer_part(first: int, at: int, last: int) -> Edit:
     return Edit("take", "frames", f"[{part[0]}, {part[1]}]")
 
 
-def _course(views: KeypointViews, windows: NDArray) -> tuple[Sequence[int], int, float, tuple[float, float]] | None:
+def _course(views: KeypointViews, windows: NDArray) -> tuple[tuple[str, ...], int, float, tuple[float, float]] | None:
     """Cameras whose clocks change, the frame of a step (0 of a drift), its size [frames], costs [px] with it, without.
 
     None where constant offsets fit as well. Of a drift, the size is in each frame.
@@ -144,7 +143,7 @@ def _course(views: KeypointViews, windows: NDArray) -> tuple[Sequence[int], int,
         frame = _first_after(views, -size * others, windows[part - 1][0], windows[part][-1])  # in frames of the group
         if 2 * len(group) == cameras and size < 0:  # dropped frames are more frequent than repeated ones
             group, size = tuple(np.flatnonzero(others)), -size
-    return group, frame, size, (best, without)
+    return tuple(views.rig.names[c] for c in group), frame, size, (best, without)
 
 
 def _both_ways(costs: NDArray, late: NDArray, slope: NDArray) -> NDArray:

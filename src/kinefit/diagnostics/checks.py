@@ -312,10 +312,9 @@ def _moved_within(c: Checked) -> list[Finding]:
 def _strangers(c: Checked) -> list[Finding]:
     """Cameras that agree with no other once all are synchronised, which are left out, or what explains them."""
     turned, back = rig.turn_findings(c.sampled)
-    if turned and _sizes(c, back, views.meet(back)[0])[0][0].severity != "fault":  # else lenses are wrong
-        c.views, c.sampled = replace(c.views, rig=back.rig), back
-    else:
-        turned = []
+    if turned and _sizes(c, back, views.meet(back)[0])[0][0].severity == "fault":  # lenses are wrong
+        turned, back = [], c.sampled
+    c.views, c.sampled = replace(c.views, rig=back.rig), back
     found = cameras.stranger_findings(c.sampled)
     if found:  # a mistake is certain: smaller improvements suffice
         gross = cameras.distortion_findings(c.sampled)
@@ -417,8 +416,7 @@ CHECKS = (
     Check("person in each camera", _unseen, _VIEWS, alike="A detector that fails on a whole video looks the same."),
     Check(
         "course of the clocks", _clock_course, _VIEWS, 0.4,
-        "A camera that follows another person from then on, frames that were cut out, and, of a movement that repeats "
-        "itself, some periods more look the same.",
+        "Another person followed from then on, cut frames, and whole periods of a repeated movement look the same.",
     ),
     Check("groups", _groups, _VIEWS, 0.1, "Cameras that follow different people in one part look the same."),
     Check("cameras that move", _moved_within, _VIEWS, 0.4, "A zoom during the recording looks the same."),

@@ -108,10 +108,8 @@ def focal_findings(views: KeypointViews) -> list[Finding]:
 
     None of two cameras: a wrong pose of one of them looks the same.
     """
-    if len(views.rig) < 3:
-        return []
     uv = sample(views)
-    trials = _of_all(_focal_lengths(), views.rig, uv)
+    trials = _of_all(_focal_lengths() if len(views.rig) > 2 else (), views.rig, uv)
     mistake = _best(trials, disagreement_share(views.rig, uv), lenient=True)
     return [mistake.finding(views.rig.names, views.limit)] if mistake else []
 

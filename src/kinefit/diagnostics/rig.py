@@ -154,8 +154,7 @@ def turned_cameras(views: KeypointViews) -> tuple[Camera, ...]:
     """
     if len(views.rig) != 2:
         return ()
-    fits = sorted((_turned(views, c) for c in (0, 1)), key=lambda fit: fit[0])
-    (error, angle, camera), (other_error, _, other) = fits
+    (error, angle, camera), (other_error, _, other) = sorted((_turned(views, c) for c in (0, 1)), key=lambda f: f[0])
     if not (error < _MAX_TURNED_ERROR * views.limit and _TURN_RANGE[0] < angle < _TURN_RANGE[1]):
         return ()
     return (camera,) if error < _MAX_OTHER_RATIO * other_error else (camera, other)
@@ -167,8 +166,8 @@ def _turned(views: KeypointViews, c: int) -> tuple[float, float, Camera]:
     rays, others = (camera.ray(uv) for camera, uv in zip((own, other), np.moveaxis(views.pixels(), 1, 0)[[c, 1 - c]]))
     base = other.centre_world - own.centre_world
     normals = np.cross(base / max(np.linalg.norm(base), 1e-9), others)
-    sines, known = np.linalg.norm(normals, axis=1, keepdims=True), np.isfinite(rays + normals).all(axis=1)
-    known &= sines[:, 0] > _MIN_SINE * np.linalg.norm(others, axis=1)
+    sines = np.linalg.norm(normals, axis=1, keepdims=True)
+    known = np.isfinite(rays + normals).all(axis=1) & (sines[:, 0] > _MIN_SINE * np.linalg.norm(others, axis=1))
     if known.sum() < _MIN_TURN_POINTS:
         return np.inf, 0.0, own
     rays, normals, R = rays[known], (normals / sines)[known], np.eye(3)
@@ -189,16 +188,15 @@ def turn_findings(views: KeypointViews) -> tuple[list[Finding], KeypointViews]:
     found = turned_cameras(views)
     if not found:
         return [], views
-    turns = [views.rig[c.name].T_camera_world @ se3.inverse(c.T_camera_world) for c in found]
-    angles = [np.degrees(np.linalg.norm(se3.log_so3(T[:3, :3]))) for T in turns]
-    which = " or ".join(f"{c.name} by {angle:.1f} degrees" for c, angle in zip(found, angles))
+    turns = [se3.log(views.rig[c.name].T_camera_world @ se3.inverse(c.T_camera_world))[3:] for c in found]
+    which = " or ".join(f"{c.name} by {np.degrees(np.linalg.norm(w)):.1f} degrees" for c, w in zip(found, turns))
     text = f"A camera was rotated since the calibration: {which}. Turned back, the two cameras agree."
     confidence = "Certain: a rotation of the other camera explains the keypoints worse."
     if len(found) > 1:
         confidence = "Likely; the images do not show which of the two. With depth or markers, kinefit track does."
-    remedy = "Calibrate again (kinefit calibrate people or board)."
-    finding = Finding("fault", "moved", text, tuple(c.name for c in found), confidence, remedy)
-    return [finding], replace(views, rig=views.rig.with_camera(found[0]))
+    names, remedy = tuple(c.name for c in found), "Calibrate again (kinefit calibrate people or board)."
+    back = replace(views, rig=views.rig.with_camera(found[0]))
+    return [Finding("fault", "moved", text, names, confidence, remedy)], back
 
 
 def coverage(views: KeypointViews, x: NDArray) -> tuple[CameraCoverage, ...]:
