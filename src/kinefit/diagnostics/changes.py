@@ -124,7 +124,7 @@ def _course(views: KeypointViews, windows: NDArray) -> tuple[tuple[str, ...], in
     least, without = float(costs.min(axis=2).mean()), float(ways[0, 0].mean())
     if without < _MIN_EXCESS * least:
         return None
-    cameras, group, at = len(views.rig), (0,), 0
+    cameras, at, group = len(views.rig), 0, tuple(range(1))
     best = without - _MIN_EXPLAINED * (without - least)
     for count in range(1, cameras // 2 + 1 if cameras <= _MAX_SUBSET else 2):
         for some in combinations(range(cameras), count):
@@ -133,16 +133,16 @@ def _course(views: KeypointViews, windows: NDArray) -> tuple[tuple[str, ...], in
                 best, group, at = float(total.min()), some, int(np.argmin(total))
     if at == 0:
         return None
-    total, sizes = _of_group(ways, pairs, group), np.where(slope, np.inf, np.abs(late[:, -1]))
-    fits = (total <= _PERIOD_RATIO * best) & (sizes > 0.0) & (slope[at] == 0.0)
-    while (smaller := np.flatnonzero(fits & (sizes < sizes[at]) & (abs(late - late[at])[:, -1] > _PERIOD_FRAMES))).size:
+    total, far = _of_group(ways, pairs, group), np.where(slope, np.inf, np.abs(late[:, -1]))
+    fits = (total <= _PERIOD_RATIO * best) & (far > 0.0) & (slope[at] == 0.0)
+    while (smaller := np.flatnonzero(fits & (far < far[at]) & (abs(late - late[at])[:, -1] > _PERIOD_FRAMES))).size:
         at = int(smaller[np.argmin(total[smaller])])  # a movement that repeats itself: the nearest period
     size, frame = float(slope[at] or late[at][-1]), 0
     if not slope[at]:
         part, others = int(np.argmax(late[at] != 0.0)), ~np.isin(np.arange(cameras), group)
         frame = _first_after(views, -size * others, windows[part - 1][0], windows[part][-1])  # in frames of the group
         if 2 * len(group) == cameras and size < 0:  # dropped frames are more frequent than repeated ones
-            group, size = tuple(np.flatnonzero(others)), -size
+            group, size = tuple(np.flatnonzero(others).tolist()), -size
     return tuple(views.rig.names[c] for c in group), frame, size, (best, without)
 
 
