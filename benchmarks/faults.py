@@ -14,6 +14,7 @@ PARTS = {
     "faults_inputs": "takes with wrong files that `kinefit track` names, and false alarms on right ones",
     "faults_users": "files as users have them: what they state is read, or named",
     "faults_users_files": "names, times, masks and depth of files as users have them: right, said and unsaid",
+    "faults_cameras": "cameras and clocks that go wrong within a take: right, said, wrong and unsaid",
     "faults_sides": "mirrored worlds and exchanged sides of markers that are named, and false alarms",
 }
 

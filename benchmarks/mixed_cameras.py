@@ -13,6 +13,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.cameras import contradiction_sentences as contradicting
 from kinefit.tracking.cameras import sentences as moved
 
-FIRST, DRAWS, TURNED = 40, 20, 20
+FIRST, DRAWS, TURNED, TURNED_VIDEOS = 40, 20, 20, 4
 QUICK_SECONDS = 0.5
 DEGREES = 3.0
 BARS = ("cameras", "cameras_silhouettes", "cameras_markers")
@@ -48,6 +49,7 @@ def run(quick: bool = False) -> None:
     frames = round(takes.RATE * (QUICK_SECONDS if quick else takes.SECONDS))
     _bars(range(FIRST, FIRST + (1 if quick else DRAWS)), frames, BARS[:1] if quick else BARS)
     _turned(range(FIRST, FIRST + (1 if quick else TURNED)), frames)
+    _turned_videos(range(FIRST, FIRST + (1 if quick else TURNED_VIDEOS)), frames)
 
 
 def tracked(recording: takes.Recording, rig: Rig, mix: str) -> Motion:
@@ -125,3 +127,20 @@ def _turned(draws: range, frames: int) -> None:
     for k, what in enumerate(("joints", "angles")):
         share = percent(np.concatenate([one[k] for one in inside]) <= SIGMAS)
         figure(f"mixed_depth_turned_{what}_inside", share, "% within two deviations", ">= 90")
+
+
+def _turned_videos(draws: range, frames: int) -> None:
+    named: list[bool] = []
+    joints: dict[str, list[float]] = {}
+    for draw in draws:
+        r, name = takes.record(draw, frames), takes.CAMERAS[draw % 2]
+        for mix, axis in product(("cameras_depth", "cameras_markers"), range(3)):
+            T = se3.transform(se3.exp_so3(np.radians(DEGREES) * np.eye(3)[axis]), np.zeros(3))
+            motion = tracked(r, r.told.with_camera(r.told[name].with_pose(T @ r.told[name].T_camera_world)), mix)
+            named.append(_named(motion) == {name})
+            joints.setdefault("xyz"[axis], []).append(errors(r.truth, motion)[2])
+            print(f"# draw {draw} {mix}: {name} about {'xyz'[axis]}, {joints['xyz'[axis]][-1]:.1f} mm, "
+                  f"named {named[-1]}", flush=True)  # fmt: skip
+    figure("mixed_video_turned_named", 100 * float(np.mean(named)), "% of takes", ">= 100")
+    for axis, values in joints.items():
+        figure(f"mixed_video_turned_{axis}", float(np.mean(values)), "mm", "<= 15")

@@ -15,6 +15,8 @@ from kinefit.subject.parameters import World
 from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.tracking.cameras import as_found, between, composed, sentences
 
+WRISTS_ANKLES = ("l_ulnar_styloid", "r_ulnar_styloid", "l_lateral_malleolus", "r_lateral_malleolus")
+
 
 @pytest.fixture(scope="module")
 def take(tmp_path_factory, copy_take):
@@ -36,10 +38,7 @@ def test_markers_set_cameras_right_that_point_beside_their_calibration():
     seen = simulate_keypoints(motion, rig, noise_px=0.5, drift_px=0.0, outliers=0.0, missing=0.0)
     points = body.markers("HANIM_45")
     steps = []
-    for f in range(len(motion)):
-        frames, _ = body.tree.forward(motion.Ts_world_root[f], motion.angles[f])
-        turn, place = frames[points.segments, :9].reshape(-1, 3, 3), frames[points.segments, 9:]
-        x = place + np.einsum("nij,nj->ni", turn, points.points)
+    for f, x in enumerate(motion.positions(points)):
         time = f / motion.rate
         pixels = [
             KeypointFrame(k.camera, time, k.names, k.points[f, 0], k.confidence[f, 0], k.keypoint_set) for k in seen
@@ -90,6 +89,24 @@ def test_a_camera_turned_about_any_axis_is_moved_back_and_named():
     assert np.degrees(np.linalg.norm(left[3:])) < 1.0
     away = {n: np.linalg.norm(m.positions() - motion.positions(), axis=-1).mean() for n, m in told.items()}
     assert away["wrong"] < away["right"] + 0.005
+
+
+@pytest.mark.parametrize(("name", "axis"), [("cam01", 0), ("cam02", 1), ("cam02", 2)])
+def test_of_two_cameras_beside_four_markers_the_turned_one_is_moved_back_and_named(name, axis):
+    motion = squat_and_wave(rate=15.0, duration=2.0)
+    rig, points = studio_rig(motion).select(("cam01", "cam02")), motion.body.markers("HANIM_45")
+    seen = simulate_keypoints(motion, rig, noise_px=2.0, drift_px=1.0, outliers=0.05, missing=0.05)
+    steps = []
+    for f, x in enumerate(motion.positions(points.select(WRISTS_ANKLES))):
+        time = f / motion.rate
+        steps.append([*(KeypointFrame.of_record(k, f, time) for k in seen),
+                      MarkerFrame("mocap", time, WRISTS_ANKLES, x, marker_set="HANIM_45")])  # fmt: skip
+    turn = se3.transform(se3.exp_so3(np.radians(3.0) * np.eye(3)[axis]), np.zeros(3))
+    wrong = rig.with_camera(rig[name].with_pose(turn @ rig[name].T_camera_world))
+    found = track(Recording.of_frames(steps, wrong, rate=motion.rate), motion.body)
+    said = sentences(found.provenance, TrackSettings().camera_errors)
+    assert [s.split()[1] for s in said] == [name]
+    assert np.linalg.norm(found.positions() - motion.positions(), axis=-1).mean() < 0.015
 
 
 def test_two_moves_of_a_camera_amount_to_one():

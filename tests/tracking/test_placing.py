@@ -1,4 +1,4 @@
-"""Depth cameras that do not stand where the videos see the person are moved, or left out, and named."""
+"""Cameras beside a depth camera: the one that does not stand where it is stated is moved, or left out, and named."""
 
 import numpy as np
 import pytest
@@ -33,11 +33,11 @@ def scene():
     return Rig((*cameras, front)), motion, steps
 
 
-def recording(scene, turn):
-    """What was seen, with the depth camera stated as turned about its own axes by a vector (3,) [deg]."""
+def recording(scene, turn, name="depth"):
+    """What was seen, with a camera stated as turned about its own axes by a vector (3,) [deg]."""
     rig, motion, steps = scene
     T = se3.transform(se3.exp_so3(np.radians(turn)), np.zeros(3))
-    stated = Rig(tuple(c.with_pose(T @ c.T_camera_world) if c.name == "depth" else c for c in rig))
+    stated = rig.with_camera(rig[name].with_pose(T @ rig[name].T_camera_world))
     return Recording.of_frames(steps, stated, rate=motion.rate, up="y", on_body=("depth",))
 
 
@@ -72,3 +72,13 @@ def test_a_depth_camera_upside_down_is_left_out_and_named(scene):
     (sentence,) = [s for s in sentences(motion.provenance, PRIOR) if "excluded" in s]
     assert "depth camera depth was excluded" in sentence and "rotation by 1" in sentence
     assert "depth" not in motion.residuals
+
+
+@pytest.mark.parametrize(("name", "turn"), [("cam02", (3.0, 0.0, 0.0)), ("cam01", (0.0, -3.0, 0.0)),
+                                            ("cam02", (0.0, 3.0, 0.0)), ("cam01", (0.0, 0.0, 3.0))])  # fmt: skip
+def test_a_turned_video_camera_is_moved_and_named_and_no_other(scene, name, turn):
+    motion = track(recording(scene, turn, name), load_body("humanoid"), smooth=False)
+    (sentence,) = sentences(motion.provenance, PRIOR)
+    assert sentence.startswith(f"camera {name} was found") and LEFT_OUT not in motion.provenance
+    away = np.linalg.norm(motion.positions() - scene[1].positions(), axis=-1)
+    assert away.mean() < 0.025

@@ -54,6 +54,8 @@ _MIN_EXPLAINED_ALONE = 0.9  # share of the squared disagreement
 _MAX_RESIDUAL_RATIO = 0.5  # of the best explanation to the second best
 _MAX_RESIDUAL = 0.5  # [sigmas of the keypoints] that the moved cameras do not explain
 _MAX_RESIDUAL_CLEAR = 0.75  # the same, if no other cameras explain it nearly as well: correct ones leave 0.6 to 0.7
+_MIN_ROLL = 1.0  # [deg] of a camera about its axis; correct ones: up to 0.3 by a detector's errors
+_MIN_ROLL_RATIO = 3.0  # to the second largest
 _MAX_OUTLIERS = 0.15  # share of a camera's points that agree with no other camera: detectors stay well below
 
 
@@ -389,6 +391,13 @@ def _moved_cameras(parts: Disagreement, accuracy: float, take: Path, noticed: bo
     whole = parts.explained(parts.of(*cameras))
     refine = f"Run: {command('check', take, '--refine')}"
     text = f"The cameras disagree by {whole:.1f} px (root mean square), constant over the recording"
+    rolls = np.degrees(parts.solve(*cameras)[:, TURN.start])
+    next_most, most = np.argsort(np.abs(rolls))[-2:]
+    if abs(rolls[most]) > max(_MIN_ROLL, _MIN_ROLL_RATIO * abs(rolls[next_most])):
+        name, text = parts.cameras[most], f"{text}: {parts.cameras[most]} is rotated about its own axis"
+        confidence = f"Certain: all cameras fitted together, no other is by more than {abs(rolls[next_most]):.1f}."
+        text = f"{text} by {rolls[most]:+.1f} degrees since the calibration."
+        return [Finding("doubt", "moved", text, (name,), confidence, refine)]
     for count in (1, 2):
         if len(cameras) < 2 + count:
             break

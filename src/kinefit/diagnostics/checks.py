@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, load_body
-from kinefit.diagnostics import cameras, frozen, images, lenient, mistakes, person, rig, timing, views
+from kinefit.diagnostics import cameras, changes, frozen, images, lenient, mistakes, person, rig, timing, views
 from kinefit.diagnostics.cameras import CameraBias
 from kinefit.diagnostics.rig import CameraCoverage
 from kinefit.diagnostics.sensors import SensorAlignment
 from kinefit.diagnostics.timing import TimeOffsets
-from kinefit.diagnostics.views import KeypointViews
+from kinefit.diagnostics.views import KeypointViews, make_views, with_sides_right
 from kinefit.errors import KinefitError
 from kinefit.findings import Finding, faults_of, ranked
 from kinefit.geometry.camera import Rig
@@ -36,6 +36,7 @@ QUICK_S = 0.5
 _UNKNOWN: Any = None  # what no check has found out yet
 _SAMPLE_FRAMES = 240  # spread over the recording, for properties that are constant over time
 _QUICK_FRAMES = 150  # consecutive frames in which a quick check compares clocks
+_COURSE_FRAMES = 360  # consecutive frames in which it looks for clocks that change
 _QUICK_INTERVALS = 5  # candidates for these, spread over the recording: the one with most motion is used
 _MAX_JUMP_PX = 100.0  # in five frames; a larger one is to another person
 _STATED_IMAGES = ("scaled", "letterboxed")  # statements of the take that one image of the video can contradict
@@ -274,15 +275,46 @@ def _unseen(c: Checked) -> list[Finding]:
     return findings
 
 
+def _clock_course(c: Checked) -> list[Finding]:
+    """Clocks that change within the take; the views are put in step for the checks that follow."""
+    moving = c.moving
+    if c.quick and len(moving) < min(map(len, c.keypoints)):
+        moving = make_views(c.rig, [k.rows(slice(0, _COURSE_FRAMES), k.time_offset) for k in c.keypoints])
+    found, seen = changes.clock_findings(with_sides_right(moving.select(c.views.rig.names)), _first_frame(c))
+    if found:
+        c.views = c.moving = seen
+    return found
+
+
+def _first_frame(c: Checked) -> int:
+    return c.observations.frames[0] if c.observations else 0
+
+
 def _groups(c: Checked) -> list[Finding]:
-    found = timing.group_findings(c.rig, c.keypoints, c.observations.frames[0] if c.observations else 0)
+    found = timing.group_findings(c.rig, c.keypoints, _first_frame(c))
     c.sound = not found
+    return found
+
+
+def _moved_within(c: Checked) -> list[Finding]:
+    """Cameras that moved during the recording, which lose what they saw in their other pose."""
+    _synchronise(c, c.views.rig.names)
+    if c.quick and c.frames_late:  # the views are of an interval
+        return []
+    every = -(-min(map(len, c.keypoints)) // len(c.views)) if c.quick else 1
+    found, seen = changes.move_findings(c.views, _first_frame(c) + every * np.arange(len(c.views)))
+    if found:
+        c.views, c.moving = seen, c.moving if c.quick else seen
+        _synchronise(c, c.views.rig.names)
     return found
 
 
 def _strangers(c: Checked) -> list[Finding]:
     """Cameras that agree with no other once all are synchronised, which are left out, or what explains them."""
-    _synchronise(c, c.views.rig.names)
+    turned, back = rig.turn_findings(c.sampled)
+    if turned and _sizes(c, back, views.meet(back)[0])[0][0].severity == "fault":  # lenses are wrong
+        turned, back = [], c.sampled
+    c.views, c.sampled = replace(c.views, rig=back.rig), back
     found = cameras.stranger_findings(c.sampled)
     if found:  # a mistake is certain: smaller improvements suffice
         gross = cameras.distortion_findings(c.sampled)
@@ -290,7 +322,7 @@ def _strangers(c: Checked) -> list[Finding]:
     strange = {camera for one in found for camera in one.cameras}
     c.sound = all(one.kind == "stranger" for one in found) and len(c.views.rig) > 1
     if not c.sound:
-        return found
+        return [*turned, *found]
     if strange:
         _synchronise(c, [name for name in c.views.rig.names if name not in strange])
     c.x, _ = views.meet(c.sampled)
@@ -298,7 +330,7 @@ def _strangers(c: Checked) -> list[Finding]:
     if not c.sound:
         remedy = "Point all at the same place."
         found = [*found, Finding("fault", "apart", "No two cameras see the same point.", remedy=remedy)]
-    return found
+    return [*turned, *found]
 
 
 def _synchronise(c: Checked, names: Sequence[str]) -> None:
@@ -309,18 +341,25 @@ def _synchronise(c: Checked, names: Sequence[str]) -> None:
 
 
 def _scale(c: Checked) -> list[Finding]:
-    sets = list(dict.fromkeys(k.keypoint_set for k in c.keypoints))
-    body = load_body(c.body) if isinstance(c.body, str) else c.body
-    ratios = person.bone_ratios(body, sets, c.sampled, c.x)
-    found = person.size_findings(person.stature(body, ratios), c.height)
+    found, ratios, sets = _sizes(c, c.sampled, c.x)
     if found[0].severity == "fault":
         found = person.order_findings(ratios, sets) or mistakes.focal_findings(c.sampled) or found
     return found
 
 
+def _sizes(c: Checked, seen: KeypointViews, x: NDArray) -> tuple[list[Finding], NDArray, list[str]]:
+    """Findings on the person's size, the ratios of bones to the body's that they are of, and the keypoint sets."""
+    sets = list(dict.fromkeys(k.keypoint_set for k in c.keypoints))
+    body = load_body(c.body) if isinstance(c.body, str) else c.body
+    ratios = person.bone_ratios(body, sets, seen, x)
+    return person.size_findings(person.stature(body, ratios), c.height), ratios, sets
+
+
 def _clocks(c: Checked) -> list[Finding]:
     offsets = {entry.name: entry.time_offset for entry in c.take.cameras} if c.take else {}
-    return timing.time_findings(c.times, offsets, timing.fast_pixels(c.stepped), confirmed=bool(c.frames_late))
+    found = timing.time_findings(c.times, offsets, timing.fast_pixels(c.stepped), confirmed=bool(c.frames_late))
+    known = _named(c, "rate", "kicked")  # a drift, or too few frames
+    return [f for f in found if f.severity in ("fault", "good") or not f.cameras or not {*f.cameras} <= known]
 
 
 def _biases(c: Checked) -> list[Finding]:
@@ -332,7 +371,12 @@ def _biases(c: Checked) -> list[Finding]:
 
 def _coverage(c: Checked) -> list[Finding]:
     c.coverage = rig.coverage(c.sampled, c.x)
-    return rig.coverage_findings(c.coverage)
+    return rig.coverage_findings([one for one in c.coverage if one.camera not in _named(c, "kicked", "frozen")])
+
+
+def _named(c: Checked, *kinds: str) -> set[str]:
+    """Cameras that findings of some kinds are about."""
+    return {name for found in c.findings if found.kind in kinds for name in found.cameras}
 
 
 _VIEWS = ("sound", "views")
@@ -370,7 +414,12 @@ CHECKS = (
         "A camera that was moved far may look like a wrong sign or focal length, and a mirrored world like its images.",
     ),
     Check("person in each camera", _unseen, _VIEWS, alike="A detector that fails on a whole video looks the same."),
+    Check(
+        "course of the clocks", _clock_course, _VIEWS, 0.4,
+        "Another person followed from then on, cut frames, and whole periods of a repeated movement look the same.",
+    ),
     Check("groups", _groups, _VIEWS, 0.1, "Cameras that follow different people in one part look the same."),
+    Check("cameras that move", _moved_within, _VIEWS, 0.4, "A zoom during the recording looks the same."),
     Check(
         "other cameras", _strangers, _VIEWS, 0.4,
         "The calibration or the video of another camera, and keypoints of another person look the same.",

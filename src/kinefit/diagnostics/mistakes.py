@@ -104,9 +104,12 @@ def mistake_findings(views: KeypointViews, take_file: str = "the take", *, lenie
 
 
 def focal_findings(views: KeypointViews) -> list[Finding]:
-    """Find focal lengths of another image size, after the person's size was found implausible."""
+    """Find focal lengths of another image size, after the person's size was found implausible.
+
+    None of two cameras: a wrong pose of one of them looks the same.
+    """
     uv = sample(views)
-    trials = _of_all(_focal_lengths(), views.rig, uv)
+    trials = _of_all(_focal_lengths() if len(views.rig) > 2 else (), views.rig, uv)
     mistake = _best(trials, disagreement_share(views.rig, uv), lenient=True)
     return [mistake.finding(views.rig.names, views.limit)] if mistake else []
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.diagnostics.views import KeypointViews
 from kinefit.findings import Finding, Severity, listed
+from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 
 _FIELD_OF_VIEW_RANGE = (15.0, 130.0)  # [deg] of the longer side: from a long tele lens to the widest without fisheye
@@ -20,6 +21,12 @@ _MAX_FOCAL_DIFFERENCE = 0.15  # log ratio, of equal lenses and image sizes
 _MIN_ANGLE = 15.0  # [deg] between the lines of two views: below, depth is 4 times less certain than what is lateral
 _MAX_ANISOTROPY = 4.0  # of a point's standard deviations
 _MIN_HEIGHT_PX = 200  # of a person: pose detectors scale people to about this
+_TURN_RANGE = np.radians(1.5), np.radians(15.0)  # of a camera that was moved; calibrated ones: up to 0.7 degrees
+_TURN_ROUNDS = 25  # of reweighted least squares
+_MAX_TURNED_ERROR = 0.15  # after the rotation, as a share of the limit: a detector's noise is 0.07
+_MAX_OTHER_RATIO = 0.92  # of that error to the other camera's: about the vertical, both rotations leave nearly the same
+_MIN_SINE = 0.15  # of the angle between ray and baseline
+_MIN_TURN_POINTS = 100  # in both images
 _GRID_CELLS = 6  # of the volume along each axis, for a camera's coverage
 
 
@@ -137,6 +144,59 @@ def _anisotropy(ways: NDArray) -> float:
     information = sum(np.eye(3) - np.outer(w, w) for w in ways)
     values = np.linalg.eigvalsh(information)
     return float(np.sqrt(values[-1] / max(values[0], 1e-12)))
+
+
+def turned_cameras(views: KeypointViews) -> tuple[Camera, ...]:
+    """Of two cameras that disagree those that agree if they are rotated about themselves, as they then stand.
+
+    Empty if they agree as they are or with no rotation. Both, the better first, where a rotation of either explains the
+    keypoints; one where a rotation of the other leaves a larger error.
+    """
+    if len(views.rig) != 2:
+        return ()
+    (error, angle, camera), (other_error, _, other) = sorted((_turned(views, c) for c in (0, 1)), key=lambda f: f[0])
+    if not (error < _MAX_TURNED_ERROR * views.limit and _TURN_RANGE[0] < angle < _TURN_RANGE[1]):
+        return ()
+    return (camera,) if error < _MAX_OTHER_RATIO * other_error else (camera, other)
+
+
+def _turned(views: KeypointViews, c: int) -> tuple[float, float, Camera]:
+    """Median epipolar error [px] after the rotation [rad] of a camera about itself that fits the other's rays best."""
+    own, other = views.rig.cameras[c], views.rig.cameras[1 - c]
+    rays, others = (camera.ray(uv) for camera, uv in zip((own, other), np.moveaxis(views.pixels(), 1, 0)[[c, 1 - c]]))
+    base = other.centre_world - own.centre_world
+    normals = np.cross(base / max(np.linalg.norm(base), 1e-9), others)
+    sines = np.linalg.norm(normals, axis=1, keepdims=True)
+    known = np.isfinite(rays + normals).all(axis=1) & (sines[:, 0] > _MIN_SINE * np.linalg.norm(others, axis=1))
+    if known.sum() < _MIN_TURN_POINTS:
+        return np.inf, 0.0, own
+    rays, normals, R = rays[known], (normals / sines)[known], np.eye(3)
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    for _ in range(_TURN_ROUNDS):
+        there = rays @ R.T
+        off = np.sum(normals * there, axis=1)
+        weight = 1.0 / (1.0 + np.square(off / (2.0 * np.median(np.abs(off)) + 1e-12)))
+        step = np.linalg.lstsq(weight[:, None] * np.cross(there, normals), -weight * off, rcond=None)[0]
+        R = se3.exp_so3(step) @ R
+    T_world = se3.transform(R, own.centre_world - R @ own.centre_world)
+    error = own.matrix[0, 0] * float(np.median(np.abs(np.sum(normals * (rays @ R.T), axis=1))))
+    return error, float(np.linalg.norm(se3.log_so3(R))), own.with_pose(own.T_camera_world @ se3.inverse(T_world))
+
+
+def turn_findings(views: KeypointViews) -> tuple[list[Finding], KeypointViews]:
+    """A fault for the one of two cameras that was rotated since the calibration, and the views with it turned back."""
+    found = turned_cameras(views)
+    if not found:
+        return [], views
+    turns = [se3.log(views.rig[c.name].T_camera_world @ se3.inverse(c.T_camera_world))[3:] for c in found]
+    which = " or ".join(f"{c.name} by {np.degrees(np.linalg.norm(w)):.1f} degrees" for c, w in zip(found, turns))
+    text = f"A camera was rotated since the calibration: {which}. Turned back, the two cameras agree."
+    confidence = "Certain: a rotation of the other camera explains the keypoints worse."
+    if len(found) > 1:
+        confidence = "Likely; the images do not show which of the two. With depth or markers, kinefit track does."
+    names, remedy = tuple(c.name for c in found), "Calibrate again (kinefit calibrate people or board)."
+    back = replace(views, rig=views.rig.with_camera(found[0]))
+    return [Finding("fault", "moved", text, names, confidence, remedy)], back
 
 
 def coverage(views: KeypointViews, x: NDArray) -> tuple[CameraCoverage, ...]:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.diagnostics.cameras import MIN_SIGMAS, without_points
+from kinefit.diagnostics.changes import MIN_FRAMES, pair_curves, shifted
 from kinefit.diagnostics.views import (
     KeypointViews,
     disagreement_share,
@@ -30,20 +31,13 @@ from kinefit.geometry.camera import Rig
 from kinefit.multiview.association import medians
 from kinefit.observations import Keypoints
 
-Curve = tuple[NDArray, NDArray]
-"""Shifts (S,) [frames] and their costs (S,) [px]."""
-
-_MAX_OFFSET = 2.0  # [s] that is searched; cameras started by hand differ by less, or by much more
-_MAX_POINTS = 12  # of the body, those with most motion
-_MAX_PAIR_FRAMES = 400  # of the first camera, for the cost of a shift
 _MAX_COST_RATIO = 0.9  # of a shift to no shift: one that fits no better counts as none
+_MAX_SHARE_RATIO = 0.9  # of the cameras' disagreement after and before a shift of many frames, which changes much
+_FAR_FRAMES = 5.0
 _MAX_WEIGHT = 2.0  # of a pair's shift: one pair with a periodic motion must not outvote the others
 _MIN_DEPTH = 1.4
 """Ratio of the median cost to the smallest one: noise alone gives 1.1, a waving hand 1.8. Also how far the advantage of
 no shift falls from the part where groups agree to the other."""
-_MIN_SINE = 0.15  # of the angle between ray and baseline: below, the ray is not informative
-_MIN_FRAMES = 12
-"""Smallest number of frames from which a shift is estimated."""
 _MAX_FRAMES = 1500  # for the fractional offsets
 _TIME_BLOCKS = 10  # for the standard error: errors within a block are correlated
 _SPEED_WINDOW = 0.1  # [s] before and after, for a speed: longer than a detector's jitter, shorter than a swing
@@ -96,24 +90,26 @@ class TimeOffsets:
         return self.offsets * self.rate
 
 
-def time_offsets(views: KeypointViews) -> TimeOffsets:
+def time_offsets(views: KeypointViews, *, near: bool = False) -> TimeOffsets:
     """Estimate the time offsets of all cameras from the motion of their keypoints.
 
     Parameters
     ----------
     views : KeypointViews with consecutive frames.
+    near : bool, whether only offsets of about a frame are sought.
     """
     cameras = len(views.rig)
     stated = (views.begins - np.median(views.begins)) * views.rate  # [frames] fractions that the take states
     unknown = TimeOffsets(views.rig.names, np.full(cameras, np.nan), np.full(cameras, np.inf), views.rate, {})
-    if len(views) < _MIN_FRAMES or cameras < 2:
+    if len(views) < MIN_FRAMES or cameras < 2:
         return unknown
     all_curves, names = pair_curves(views), views.rig.names
     unknown = replace(unknown, curves={(names[a], names[b]): curve for (a, b), curve in all_curves.items()})
     curves = {pair: curve for pair, curve in all_curves.items() if _depth(curve[1]) >= _MIN_DEPTH}
     if not curves:
         return unknown
-    whole = _from_pairs(cameras, {pair: _best_shift(*curve) for pair, curve in curves.items()})
+    far = {} if near else {pair: _best_shift(*curve) for pair, curve in curves.items()}
+    whole = _from_pairs(cameras, far)
     delays, std = _fractions(_most_motion(views), whole)
     delays = delays - stated
     still = np.setdiff1d(np.arange(cameras), list(curves))
@@ -144,24 +140,6 @@ def fast_pixels(views: KeypointViews) -> dict[str, float]:
         step = np.linalg.norm(np.einsum("fkij,fkj->fki", by_point, speed), axis=-1)
         out[camera.name] = float(np.percentile(step[np.isfinite(step)], 90)) if np.isfinite(step).any() else np.nan
     return out
-
-
-def shifted(views: KeypointViews, delays: Sequence[float] | NDArray) -> KeypointViews:
-    """Shift the views to common times: frame f of camera c was recorded at f + delays[c], delays (C,) [frames].
-
-    Interpolates linearly between frames.
-    """
-    uv = np.full_like(views.uv, np.nan)
-    t = np.arange(len(views))
-    for c, delay in enumerate(delays):
-        at = t - float(delay)
-        low = np.floor(at + 1e-9).astype(int)
-        part = np.clip(at - low, 0.0, 1.0)
-        first, second = np.clip(low, 0, len(t) - 1), np.clip(low + (part > 1e-6), 0, len(t) - 1)
-        inside = (low >= 0) & (low + (part > 1e-6) < len(t))
-        mixed = (1 - part)[:, None, None] * views.uv[first, :, c] + part[:, None, None] * views.uv[second, :, c]
-        uv[:, :, c] = np.where(inside[:, None, None], mixed, np.nan)
-    return replace(views, uv=uv)
 
 
 def _fractions(views: KeypointViews, delays: NDArray) -> tuple[NDArray, NDArray]:
@@ -207,7 +185,7 @@ def _delay_equations(views: KeypointViews) -> list[tuple[NDArray, NDArray]]:
     speed = _speed(x, max(2, round(_SPEED_WINDOW * views.rate)))  # in space: robust to outliers of one camera
     agree &= np.isfinite(speed).all(-1)[..., None]
     use = agree.sum(axis=2) >= 2
-    if use.sum() < _MIN_FRAMES:
+    if use.sum() < MIN_FRAMES:
         return []
     residual, velocity = np.full(views.uv.shape, np.nan), np.full(views.uv.shape, np.nan)
     jacobian = np.zeros((frames, points, cameras, 2, 3))
@@ -261,53 +239,12 @@ def _speed(x: NDArray, reach: int) -> NDArray:
     return np.where(known.sum(axis=1) > reach, slope, np.nan)
 
 
-
-def pair_curves(views: KeypointViews) -> dict[tuple[int, int], Curve]:
-    """Cost curves {(a, b): (shifts [frames], cost [px])}: distance of rays of b, at each shift, from those of a."""
-    reach = int(min(_MAX_OFFSET * views.rate, 0.4 * len(views)))
-    shifts = np.arange(-reach, reach + 1)
-    steps = np.diff(views.uv, axis=0)
-    motion = np.median(np.nan_to_num(np.abs(steps)).sum(-1), axis=0).sum(-1)
-    points = np.argsort(-motion)[:_MAX_POINTS]
-    rays = np.stack([camera.ray(views.uv[:, points, c]) for c, camera in enumerate(views.rig)], axis=2)
-    frames = np.unique(np.linspace(0, len(views) - 1, _MAX_PAIR_FRAMES).astype(int))
-    out = {}
-    for a, b in combinations(range(len(views.rig)), 2):
-        base = views.rig.cameras[b].centre_world - views.rig.cameras[a].centre_world
-        if np.linalg.norm(base) < 1e-6:
-            continue
-        focal = np.sqrt(views.rig.cameras[a].matrix[0, 0] * views.rig.cameras[b].matrix[0, 0])
-        cost = np.array([_epipolar_error(rays[:, :, a], rays[:, :, b], base, frames, int(s)) for s in shifts])
-        if np.isfinite(cost).sum() >= 3:
-            out[a, b] = shifts, focal * cost
-    return out
-
-
-def _epipolar_error(rays_a: NDArray, rays_b: NDArray, base: NDArray, frames: NDArray, shift: int) -> float:
-    """Mean angle [rad] between rays of b at frame + shift and the epipolar planes of a's rays, without constant parts.
-
-    NaN with too few rays.
-    """
-    frames = frames[(frames + shift >= 0) & (frames + shift < len(rays_b))]
-    if len(frames) < _MIN_FRAMES:
-        return np.nan
-    a, b = rays_a[frames], rays_b[frames + shift]
-    normal = np.cross(base / np.linalg.norm(base), a)
-    sine = np.linalg.norm(normal, axis=-1, keepdims=True)
-    angle = np.sum(np.where(sine > _MIN_SINE, normal / np.maximum(sine, _MIN_SINE), np.nan) * b, axis=-1)
-    enough = np.isfinite(angle).sum(axis=0) >= _MIN_FRAMES
-    if not enough.any():
-        return np.nan
-    angle = angle[:, enough]
-    apart = np.abs(angle - medians(angle.T))
-    return float(np.nanmean(np.minimum(apart, 3.0 * np.nanmedian(apart))))
-
-
 def _best_shift(shifts: NDArray, cost: NDArray) -> tuple[float, float]:
     """Shift [frames] of smallest cost, and its weight, from a curve (S,), (S,); 0 if no other fits clearly better."""
     cost = np.where(np.isfinite(cost), cost, np.inf)
     at, zero = int(np.argmin(cost)), int(np.flatnonzero(shifts == 0)[0])
-    if cost[at] > _MAX_COST_RATIO * cost[zero]:  # a periodic motion fits as well a step later: the nearest wins
+    is_edge = at in np.flatnonzero(np.isfinite(cost))[[0, -1]]  # it falls on: the minimum may lie anywhere
+    if is_edge or cost[at] > _MAX_COST_RATIO * cost[zero]:  # a periodic motion fits as well a step later: the nearest
         at = zero
     return float(shifts[at]), min(_depth(cost) - 1.0, _MAX_WEIGHT)
 
@@ -348,8 +285,9 @@ def synchronised(views: KeypointViews) -> tuple[TimeOffsets, KeypointViews, dict
         return times, right, {}
     delays = np.round(late + (views.begins - np.median(views.begins)) * views.rate)
     moved = with_sides_right(shifted(views, delays))
-    if disagreement_share(moved.rig, sample(moved)) > disagreement_share(right.rig, sample(right)):
-        return times, right, {}
+    ratio = _MAX_SHARE_RATIO if np.abs(late).max() > _FAR_FRAMES else 1.0
+    if disagreement_share(moved.rig, sample(moved)) > ratio * disagreement_share(right.rig, sample(right)):
+        return time_offsets(right, near=True), right, {}  # of a periodic motion another period
     again = time_offsets(_unshifted(views, moved, delays) if moved.swapped.any() else right)
     return again, moved, dict(zip(views.rig.names, delays.astype(int).tolist(), strict=True))
 

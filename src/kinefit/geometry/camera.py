@@ -326,6 +326,10 @@ class Rig:
         """Rig of some of the cameras, in the order given."""
         return Rig(tuple(self[name] for name in names))
 
+    def with_camera(self, camera: Camera) -> Rig:
+        """The rig with a camera in place of the one of its name."""
+        return Rig(tuple(camera if c.name == camera.name else c for c in self.cameras))
+
     def moved(self, T_new_world: ArrayLike) -> Rig:
         """The rig in another world frame, T_new_world (4, 4) [m]."""
         T_world_new = inverse(np.asarray(T_new_world, float))

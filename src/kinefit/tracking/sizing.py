@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.marker_sets import MarkerPlacement
 from kinefit.bodies.parts import has_unknown_gear
+from kinefit.diagnostics.rig import turned_cameras
+from kinefit.diagnostics.views import make_views
 from kinefit.errors import KinefitError, ObservationError, TrackingError
 from kinefit.findings import INVERTED
 from kinefit.frame.results import FrameResult
@@ -43,6 +45,7 @@ _POSES = 8  # and how many of them it is found from: twice as many change no hal
 _MARKER_POSES = 16  # of markers alone, whose places are found by how they move; a frame of them costs little
 _MATCHES = 3  # rounds of matching and solving
 _PLACES = 2  # fits with a better spread of the markers' places; it changes by less than a tenth from then on
+_TURN_FRAMES, _TURN_POSES = 240, 10  # that decide whether a video camera was rotated, and which
 _MOVES = 3  # times that cameras are moved to where a subject fit has found them
 _MIN_FRAME_QUALITY = 0.5  # quality of a frame that the shape may be found from
 
@@ -134,6 +137,7 @@ def fitted_to_person(
         person = replace(person, subject=subject)
         return _by_all(person, body, settings, progress, size=False) if unknown else person
     if cameras >= 2:
+        person = _with_turned_camera(person, body, settings) if cameras == 2 and others else person
         moved: CameraExtrinsics | None = None
         for last in (False,) * _MOVES + (True,):
             by_keypoints = fit_subject(
@@ -160,6 +164,21 @@ def fitted_to_person(
             person = sized_by_depth(person, progress)
     unknown = unknown and (bool(recording.sensors) or has_unknown_gear(person.subject.body))
     return _by_all(person, body, settings, progress, height=height, trial=trial) if others or unknown else person
+
+
+def _with_turned_camera(person: SizedPerson, body: Body, settings: TrackSettings) -> SizedPerson:
+    """With the one of two video cameras turned back that does not agree; depth cameras decide if these two do not."""
+    r = person.recording
+    videos = tuple(dict.fromkeys(k.camera for k in r.keypoints))
+    tried = [
+        _with_cameras(person, r.rig.with_camera(camera))
+        for camera in turned_cameras(make_views(r.rig.select(videos), r.keypoints).spread(_TURN_FRAMES))
+    ]
+    if len(tried) > 1:
+        subjects = [fit_subject(body, channels_of(p.recording, body, settings), frames=_TURN_POSES) for p in tried]
+        placed = [placed_cameras(p.recording, subject, settings) for p, subject in zip(tried, subjects)]
+        tried = [p for p, depth in zip(tried, placed) if depth and all(one.is_near for one in depth.values())]
+    return tried[0] if len(tried) == 1 else person
 
 
 def _with_cameras(person: SizedPerson, rig: Rig) -> SizedPerson:

@@ -1,0 +1,57 @@
+"""Two cameras of which one was rotated about itself since the calibration: it is named, or both where none can say."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kinefit.diagnostics.checks import check_keypoints
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Rig
+from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
+
+MOTION = squat_and_wave(rate=15.0, duration=4.0)
+STUDIO = studio_rig(MOTION)
+PAIR = STUDIO.select(("cam01", "cam02"))
+SEEN = simulate_keypoints(MOTION, PAIR, noise_px=3.0, outliers=0.1, missing=0.1, seed=5)
+
+
+def turned(rig, name, degrees, axis):
+    T = se3.transform(se3.exp_so3(np.radians(degrees) * np.eye(3)[axis]), np.zeros(3))
+    return rig.with_camera(rig[name].with_pose(T @ rig[name].T_camera_world))
+
+
+def moved(checked):
+    return [f for f in checked.findings if f.kind == "moved" and f.severity in ("fault", "doubt")]
+
+
+@pytest.mark.parametrize(("name", "axis"), [("cam01", 0), ("cam02", 0), ("cam01", 2), ("cam02", 2)])
+def test_of_two_cameras_the_one_turned_about_its_x_or_z_axis_is_named(name, axis):
+    check = check_keypoints(turned(PAIR, name, 3.0, axis), SEEN)
+    (found,) = moved(check)
+    assert (found.severity, found.cameras) == ("fault", (name,))
+    assert float(re.search(rf"{name} by ([\d.]+) degrees", found.text)[1]) == pytest.approx(3.0, abs=0.4)
+    assert {f.kind for f in check.faults} == {"moved"}
+
+
+@pytest.mark.parametrize("name", PAIR.names)
+def test_of_two_cameras_one_turned_about_its_y_axis_may_be_either(name):
+    check = check_keypoints(turned(PAIR, name, -3.0, 1), SEEN)
+    (found,) = moved(check)
+    assert name in found.cameras and {f.kind for f in check.faults} == {"moved"}
+    assert len(found.cameras) == 1 or "do not show which" in found.confidence
+
+
+def test_two_cameras_that_agree_or_have_wrong_lenses_were_not_rotated():
+    assert not moved(check_keypoints(PAIR, SEEN))
+    zoomed = Rig(tuple(replace(c, matrix=c.matrix * [[2.0, 1.0, 1.0], [1.0, 2.0, 1.0], [1.0, 1.0, 1.0]]) for c in PAIR))
+    assert not moved(check_keypoints(zoomed, SEEN))
+
+
+@pytest.mark.parametrize(("name", "degrees"), [("cam02", 3.0), ("cam03", -2.0)])
+def test_of_four_cameras_one_turned_about_its_z_axis_is_named(name, degrees):
+    seen = simulate_keypoints(MOTION, STUDIO, noise_px=3.0, outliers=0.1, missing=0.1, seed=6)
+    (found,) = moved(check_keypoints(turned(STUDIO, name, degrees, 2), seen))
+    assert found.cameras == (name,) and "rotated about its" in found.text
+    assert not moved(check_keypoints(STUDIO, seen))
