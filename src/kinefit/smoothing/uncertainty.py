@@ -215,8 +215,9 @@ class _KeyFrames:
         """Keep those of a frame, if it is a key frame."""
         k = int(np.searchsorted(self.errors.frames, frame))
         if k < len(self.errors.frames) and self.errors.frames[k] == frame:
-            constant, drift = product(_with_shapes(errors, shapes, frame), self.constant), product(errors.drift, self.drift)
-            self.errors.constant[k], self.errors.drift[k] = (np.clip(v, -_LARGEST, _LARGEST) for v in (constant, drift))
+            constant, drift = _with_shapes(errors, shapes, frame), errors.drift
+            self.errors.constant[k] = np.clip(product(constant, self.constant), -_LARGEST, _LARGEST)
+            self.errors.drift[k] = np.clip(product(drift, self.drift), -_LARGEST, _LARGEST)
             if k % _KEPT_AT_ONCE == _KEPT_AT_ONCE - 1:
                 release(self.errors.constant, self.errors.drift)
 
