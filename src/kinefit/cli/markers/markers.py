@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -142,7 +142,7 @@ def identify(
     from kinefit.identification.take.takes import TakeSettings, identify_take
     from kinefit.recipes.unlabelled_markers import sapm_take
 
-    constants = {name: value for name, value in (("epsilon", epsilon), ("beta", beta)) if value is not None}
+    constants: dict[str, Any] = {name: value for name, value in (("epsilon", epsilon), ("beta", beta)) if value is not None}
     if constants and method != "sapm":
         raise click.UsageError(f"--{' and --'.join(constants)}: only for SAPM, add --method sapm.")
     settings = TakeSettings() if fill else TakeSettings(fill=0.0)
