@@ -142,7 +142,8 @@ def identify(
     from kinefit.identification.take.takes import TakeSettings, identify_take
     from kinefit.recipes.unlabelled_markers import sapm_take
 
-    constants: dict[str, Any] = {name: value for name, value in (("epsilon", epsilon), ("beta", beta)) if value is not None}
+    given = (("epsilon", epsilon), ("beta", beta))
+    constants: dict[str, Any] = {name: value for name, value in given if value is not None}
     if constants and method != "sapm":
         raise click.UsageError(f"--{' and --'.join(constants)}: only for SAPM, add --method sapm.")
     settings = TakeSettings() if fill else TakeSettings(fill=0.0)
