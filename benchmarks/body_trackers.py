@@ -5,7 +5,8 @@
 A person moves with plates of three markers on thighs, shanks, upper arms and forearms. Each plate shows an orientation,
 as a magnetic tracker does, and the marker at the nearest feature point of H-Anim its place. The mounts are known from
 the first tenth of the take, as from a calibration pose. The take of trackers starts with the body of the fit to all
-markers. Printed is how far joint centres of both are apart in the other frames, with orientations and without.
+markers; two others know neither body nor start, and the second no mounts either. Printed is how far joint centres are
+from the fit to all markers in the other frames.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ def run() -> None:
     """Print the figures."""
     folder = data("markers")
     apart: dict[bool, float] = {}
+    unknown: dict[str, float] = {}
     if folder is not None:
         with tempfile.TemporaryDirectory() as where:
             markers = read_markers(folder / FILE)
@@ -53,11 +55,18 @@ def run() -> None:
             for turned in (True, False):
                 table = _trackers(Path(where), markers, whole, turned)
                 apart[turned] = _apart(whole, _tracked(Path(where), table, markers))
+            (Path(where) / "motion.npz").unlink()
+            table = _trackers(Path(where), markers, whole, True)
+            free = "\n".join(line for line in table.splitlines() if not line.startswith("mounts"))
+            for label, lines in (("start", table), ("mounts", f"{free}\nmount_sigma = 180\n")):
+                unknown[label] = _apart(whole, _tracked(Path(where), lines, markers))
     for turned, label in ((True, "places and orientations"), (False, "places alone")):
         if turned in apart:
             print(f"{len(PLATES)} trackers, {label}: joint centres {apart[turned]:.1f} mm apart", flush=True)
     reason = "" if apart else "no recording"
     figure("worn_trackers_mm", apart.get(True), "mm of joint centres from the fit to all markers", "<= 20", reason)
+    figure("worn_trackers_start_mm", unknown.get("start"), "mm, body and start unknown", "<= 18", reason)
+    figure("worn_trackers_mounts_mm", unknown.get("mounts"), "mm, mounts unknown as well", "<= 25", reason)
     gain = apart[True] / apart[False] if apart else None
     figure("worn_trackers_turns", gain, "times the distance without orientations", "<= 1", reason)
 

@@ -1,12 +1,15 @@
 """`kinefit body`: list, copy, check, picture."""
 
 import cv2
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from tests.solvers.test_closed import LEG
 
 from kinefit.bodies import catalogue, load_body
 from kinefit.cli import main
+from kinefit.exporters import write_motion
+from kinefit.simulation.retarget import known_motion
 
 
 @pytest.fixture
@@ -51,3 +54,16 @@ def test_a_picture_shows_a_closed_pose(kinefit, tmp_path):
     picture = cv2.imread(str(tmp_path / "golfer.png"))
     assert picture.shape == (900, 900, 3) and (picture != 128).any(axis=2).mean() > 0.01
     assert kinefit("picture", "golfer", "-o", "golfer.txt").exit_code == 2
+
+
+def test_a_body_gets_more_metaballs(kinefit, tmp_path):
+    told = kinefit("refine", "arm_metaballs", "--balls", "6", "-o", "fine.npz")
+    assert told.exit_code == 0 and 'body = "fine.npz"' in told.output
+    fine, coarse = load_body(tmp_path / "fine.npz"), load_body("arm_metaballs")
+    assert [len(s.centres) for s in fine.surfaces] == [6, 6, 6] and fine.tree.coordinates == coarse.tree.coordinates
+    motion = known_motion(fine, 10.0, np.eye(4)[None], np.zeros((1, len(fine.tree.coordinates))))
+    write_motion(motion, tmp_path / "motion.npz")
+    assert kinefit("refine", "motion.npz", "--balls", "9", "-o", "finer.npz").exit_code == 0
+    assert [len(s.centres) for s in load_body(tmp_path / "finer.npz").surfaces] == [9, 9, 9]
+    told = kinefit("refine", "humanoid", "-o", "no.npz")
+    assert told.exit_code == 2 and "no limb of two or more" in told.output

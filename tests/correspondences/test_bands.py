@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinefit.bodies import load_body
+from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.body_surfaces import sample
 from kinefit.bodies.parts import free_parts, parts_state
 from kinefit.correspondences import band_rows, joint_bands, surface_rows
-from kinefit.correspondences.bands import elliptic_bands, hinge_bands, universal_band
+from kinefit.correspondences.bands import elliptic_bands, hinge_bands, universal_band, with_bands
+from kinefit.correspondences.closures import closed_at
 from kinefit.errors import BodyError
 from kinefit.geometry import se3
 from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
@@ -94,3 +95,34 @@ def test_what_has_no_bands_is_told():
     sliding = replace(body, tree=replace(body.tree, prismatic=np.ones(len(body.tree.coordinates), bool)))
     with pytest.raises(BodyError, match="sliding"):
         joint_bands(sliding)
+
+
+@pytest.mark.parametrize("sigmas", [{"all": 0.005}, {"elbow_r": 0.02, "neck": 0.01}])
+def test_a_body_with_bands_moves_as_before_where_they_are_slack(sigmas):
+    body = load_body("humanoid10")
+    banded = with_bands(body, sigmas)
+    angles = RANDOM.uniform(np.maximum(body.tree.lower, -1), np.minimum(body.tree.upper, 1))
+    angles[body.tree.owners == body.joints.index("neck")] = 0.0  # an elliptic joint's bands resist every rotation
+    new = np.zeros(len(banded.tree.coordinates))
+    new[[banded.tree.coordinate(name) for name in body.tree.coordinates]] = angles
+    state, was = BodyState(np.eye(4), new), BodyState(np.eye(4), angles)
+    np.testing.assert_allclose(
+        banded.positions(state, body.landmarks), body.positions(was, body.landmarks), atol=1e-12
+    )
+    np.testing.assert_allclose(closed_at(banded, state).value, 0.0, atol=1e-12)
+    free = dict(zip(banded.joints, np.diff(banded.tree.dof_start)))
+    banded_joints = set(body.joints[1:]) if "all" in sigmas else set(sigmas)
+    assert {joint for joint, count in free.items() if count == 6} >= banded_joints
+    assert set(np.unique([c.sigma for c in banded.closures])) == set(sigmas.values())
+    new[banded.tree.coordinate("forearm_r_band_tx")] = 0.03
+    assert np.abs(closed_at(banded, BodyState(np.eye(4), new)).value).max() == pytest.approx(0.03)
+
+
+def test_joints_that_cannot_have_bands_are_named():
+    with pytest.raises(BodyError, match="no joint 'nose'"):
+        with_bands(load_body("humanoid10"), {"nose": 0.01})
+    rower = load_body("rower")
+    sliding = rower.joints[int(rower.tree.owners[rower.tree.prismatic][0])]
+    with pytest.raises(BodyError, match="sliding"):
+        with_bands(rower, {sliding: 0.01})
+    assert with_bands(rower, {"all": 0.01}).tree.n_dofs > rower.tree.n_dofs

@@ -15,8 +15,11 @@ from tests.docs import drawn
 from tests.docs.blocks import blocks
 from tests.docs.world import world
 
+from kinefit import Markers, learn_model
+from kinefit.bodies.marker_sets import placement
 from kinefit.exporters import write_markers, write_motion
 from kinefit.geometry.camera import Rig
+from kinefit.identification.model.model import save_model
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave
 
@@ -138,8 +141,6 @@ def depth_fusion(folder):
     np.save(folder / "mediapipe_colour.npy", np.nan_to_num(seen).astype(np.float32))
     names = ("r_wrist", "l_wrist", "r_ankle", "l_ankle")
     x = motion.positions()[:, [motion.body.landmarks.names.index(name) for name in names]]
-    from kinefit import Markers
-
     write_markers(Markers(names, motion.rate, x, up=motion.up), folder / "few.trc")
     yield
 
@@ -178,12 +179,21 @@ def surfaces(folder):
     yield
 
 
+def sapm(folder):
+    motion = cut(squat_and_wave(), 0, 6)
+    points = placement(motion.body, "CMU_41").points
+    take = Markers(points.names, motion.rate, motion.positions(points), up="z")
+    write_markers(take, folder / "points.c3d")
+    save_model(learn_model(take, name="anna"), folder / "anna.json")
+    yield
+
+
 PREPARED = {
     "README": nothing, "app": nothing, "batch": batch, "blender": blender, "calibration": calibration, "check": take,
     "closed-chains": nothing, "comparison": comparison, "detect": nothing, "first-recording": first_recording,
     "index": nothing, "init": init, "install": nothing, "live": take, "one-camera": nothing,
     "recipes/depth-fusion": depth_fusion, "recipes/silhouettes": nothing,
-    "regions": nothing, "sensors": walk, "simulate": simulate, "surfaces": surfaces,
+    "recipes/sapm": sapm, "regions": nothing, "sensors": walk, "simulate": simulate, "surfaces": surfaces,
     "telephones": nothing, "view": motion, "recipes/voodoo": nothing, "which-setup": which_setup,
 }  # fmt: skip
 """{page: its function}."""

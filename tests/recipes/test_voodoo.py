@@ -9,6 +9,7 @@ from kinefit.bodies import load_body
 from kinefit.bodies.body_surfaces import nearest, sample
 from kinefit.correspondences import joint_bands
 from kinefit.errors import ObservationError
+from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, PointCloud
 from kinefit.recipes import _voodoo_boxes as boxing
@@ -207,3 +208,49 @@ def test_nothing_seen_leaves_the_body_where_it_was():
     fit = next(iter(voodoo([[PointCloud("s", 0.0, np.zeros((0, 3)))]], BODY, STATE, RIG)))
     np.testing.assert_allclose(fit.frames, FRAMES, atol=2e-2)  # the neck's bands pull: it is bent in the usual pose
     assert np.isfinite(fit.frames).all() and len(joint_bands(BODY)) == 16
+
+
+def test_angles_of_a_limb_are_those_it_was_turned_by():
+    rng, tree = np.random.default_rng(3), BODY.tree
+    for s in range(1, len(tree.segments)):
+        own = slice(tree.dof_start[s], tree.dof_start[s + 1])
+        angles = tree.usual[own] + 0.6 * rng.uniform(-1, 1, own.stop - own.start)
+        R = np.eye(3)
+        for axis, angle in zip(tree.axes[own], angles):
+            R = R @ se3.exp_so3(axis * angle)
+        np.testing.assert_allclose(motion.rotation_angles(tree.axes[own], R, tree.usual[own]), angles, atol=1e-6)
+
+
+def bent_backwards(excess):
+    """A state with the right knee and elbow beyond their ranges [rad]."""
+    angles, tree = np.array(STATE.angles), BODY.tree
+    for name in ("knee_angle_r", "elbow_flex_r"):
+        k = tree.coordinate(name)
+        angles[k] = tree.lower[k] - excess
+    return replace(STATE, angles=angles)
+
+
+def test_ranges_pair_limbs_that_are_beyond_them():
+    assert not len(motion.range_pairs(BODY, FRAMES, 1.0).limb)
+    beyond = bent_backwards(0.4)
+    frames, _ = BODY.tree.forward(beyond.T_world_root, beyond.angles)
+    pairs = motion.range_pairs(BODY, frames, 5.0)
+    assert set(pairs.limb) == {BODY.tree.segment("shank_r"), BODY.tree.segment("forearm_r")}
+    apart = np.linalg.norm(pairs.source - pairs.target, axis=1)  # chords at the lever; the axis itself does not move
+    np.testing.assert_allclose(apart[apart > 1e-9], 2 * 0.1 * np.sin(0.2), rtol=1e-6)
+    assert set(pairs.weight) == {5.0}
+
+
+def test_ranges_bend_a_knee_back_that_points_pull_beyond():
+    """Wrong points show the right shank bent forwards at the knee by 23 degrees."""
+    beyond = bent_backwards(0.4)
+    x, segment = skin(3000, beyond)
+    shank, k = BODY.tree.segment("shank_r"), BODY.tree.coordinate("knee_angle_r")
+    seen = [PointCloud("s", 0.0, x[segment == s], segment=BODY.tree.segments[s]) for s in np.unique(segment)]
+    excess = []
+    for weight in (0.0, 300.0, 3000.0):
+        settings = Settings(ranges=weight, quality=0.0, steps=(0, 40))
+        R = next(iter(voodoo([seen], BODY, STATE, RIG, settings))).frames[:, :9].reshape(-1, 3, 3)
+        own, above = slice(k, k + 1), R[BODY.tree.parents[shank]]
+        excess.append(BODY.tree.lower[k] - motion.rotation_angles(BODY.tree.axes[own], above.T @ R[shank], [0.0])[0])
+    assert excess[0] > 0.3 > excess[1] > excess[2] and excess[2] < 0.1

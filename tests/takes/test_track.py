@@ -1,17 +1,20 @@
 """A take with a depth sensor, keypoints and a few markers at once, simulated, by the command line."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from kinefit import load_body, read_motion, track
+from kinefit.bodies.marker_sets import placement
 from kinefit.cli import main
 from kinefit.errors import KinefitError
 from kinefit.exporters import write_markers, write_motion
 from kinefit.observations import Markers
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.simulation import squat_and_wave
+from kinefit.simulation import cut, squat_and_wave
 from kinefit.simulation.movements import movement, people
 from kinefit.takes.track import track_take
 from kinefit.tracking.take_recording import recording_of
@@ -135,3 +138,37 @@ def test_real_labelled_markers_choose_the_set_that_knows_most_of_them(tmp_path, 
     assert len(residuals.names) >= 30
     assert np.nanmedian(np.linalg.norm(residuals.values, axis=-1)) < REAL_MARKERS[name]
     assert np.isfinite(motion.dof_std).mean() > 0.6
+
+
+@pytest.mark.parametrize(
+    ("bands", "stretched"), [("{ all = 0.005 }", 0.02), ("{ elbow_r = 0.0001, neck = 0.01 }", 0.05)]
+)
+def test_joints_by_elastic_bands(tmp_path, bands, stretched):
+    truth = cut(squat_and_wave(rate=30), 0, 12)
+    points = placement(truth.body, "CMU_41").points
+    x = truth.positions(points) + 0.003 * np.random.default_rng(0).normal(size=(12, len(points), 3))
+    write_markers(Markers(points.names, 30.0, x, up="z"), tmp_path / "m.c3d")
+    table = f'[take]\nup = "z"\nsize = false\nbands = {bands}\n[[markers]]\nfile = "m.c3d"\n'
+    (tmp_path / "take.toml").write_text(table)
+    motion, _ = track_take(tmp_path / "take.toml")
+    ends = [motion.positions(motion.body.landmarks.select((c.point, c.to))) for c in motion.body.closures]
+    stretch = {c.name: np.linalg.norm(x[:, 0] - x[:, 1], axis=1) for c, x in zip(motion.body.closures, ends)}
+    assert 1e-4 < max(s.max() for s in stretch.values()) < stretched
+    if "elbow_r" in bands:  # the stiff band holds, and joints without bands stay as they are
+        assert max(s.max() for name, s in stretch.items() if "forearm_r" in name) < 1e-3
+        assert "shank_r_band_tx" not in motion.body.tree.coordinates
+    same = [motion.body.tree.coordinates.index(name) for name in truth.body.tree.coordinates]
+    assert np.linalg.norm(motion.joint_centres - truth.joint_centres, axis=2).mean() < 0.005
+    assert np.degrees(np.abs(motion.angles[:, same] - truth.angles)).mean() < 4.0
+    write_motion(motion, tmp_path / "motion.npz")
+    again, _ = track_take(replace(read_take(tmp_path / "take.toml"), start=tmp_path / "motion.npz"))
+    assert again.body.tree.coordinates == motion.body.tree.coordinates
+
+
+@pytest.mark.parametrize(("bands", "problem"), [("{ nose = 0.01 }", "no joint 'nose'"), ("{ all = 0 }", "in metres")])
+def test_bands_that_cannot_be_are_named_with_their_place(tmp_path, bands, problem):
+    write_markers(Markers(("C7", "CLAV", "STRN"), 30.0, np.ones((3, 3, 3)), up="z"), tmp_path / "m.c3d")
+    (tmp_path / "take.toml").write_text(f'[take]\nbands = {bands}\n[[markers]]\nfile = "m.c3d"\n')
+    with pytest.raises(KinefitError, match=problem) as raised:
+        track_take(tmp_path / "take.toml")
+    assert "bands" in str(raised.value)

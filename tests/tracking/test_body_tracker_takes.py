@@ -13,6 +13,8 @@ from kinefit.geometry import se3
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
 from kinefit.sensors.kinds.trackers import read_body_trackers
+from kinefit.sensors.points.body_trackers import BodyTrackerSensor
+from kinefit.simulation.retarget import known_motion
 from kinefit.takes.check import check_take
 from kinefit.takes.track import track_take
 
@@ -55,6 +57,25 @@ def test_the_command_tracks_the_body(taken, tmp_path):
     assert {BODY.tree.coordinates[k - 6] for k in np.flatnonzero(open_turns)} <= {"neck_extension", "neck_rotation"}
     z = off / found.dof_std[:, 6:]
     assert 0.4 < np.sqrt(np.mean(z**2)) < 1.6
+
+
+def test_lengths_follow_from_the_places_of_trackers(taken, tmp_path):
+    """A person 8 % smaller than the catalogue's body, of whom ten places are measured and nothing else is known."""
+    small = BODY.scaled(np.full(len(BODY.scale_groups), 0.92))
+    places = BodyTrackerSensor("trackers", POINTS).places(small, tuple(POINTS))
+    rng, rows = np.random.default_rng(1), []
+    for i in range(COUNT):
+        x = small.positions(a_motion().state(i), places) + 0.002 * rng.normal(size=(len(POINTS), 3))
+        rows += [f"{i / RATE:.6f},{name},{p[0]:.6f},{p[1]:.6f},{p[2]:.6f},,,," for name, p in zip(POINTS, x)]
+    (tmp_path / "trackers.csv").write_text(HEADER + "\n".join(rows) + "\n")
+    text = taken.read_text().replace("size = false\n", "").partition("shift =")[0]
+    taken.write_text(text)
+    found, moved = track_take(taken)[0], a_motion()
+    truth = known_motion(small, RATE, moved.Ts_world_root[:COUNT], moved.angles[:COUNT], up="y")
+    limbs = [BODY.tree.segment(name) for name in ("shank_r", "shank_l", "forearm_r", "forearm_l")]
+    long, short = (np.linalg.norm(body.tree.offsets[limbs], axis=1) for body in (BODY, found.body))
+    assert np.abs(short / long - 0.92).max() < 0.04
+    assert np.linalg.norm(found.joint_centres - truth.joint_centres, axis=2).mean() < 0.03
 
 
 def test_places_and_orientations_of_a_table(taken):

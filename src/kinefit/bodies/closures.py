@@ -7,6 +7,7 @@ the bindings, is a dimension that a subject fit estimates (P3 5).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,7 +53,7 @@ class Closure:
     axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sigma: float = 0.0005
-    turn_sigma: float = np.radians(2.0)
+    turn_sigma: float = math.radians(2.0)
     hard: bool = False
     place_std: float = 0.0
     turn_std: float = 0.0

@@ -17,6 +17,7 @@ Examples:
   kinefit body                                   list the bodies: people, and people with gear
   kinefit body copy snowboarder                  write snowboarder.toml, to edit and to use in a take
   kinefit body check snowboarder.toml            degrees of freedom, closures, contradictions
+  kinefit body refine humanoid_metaballs -o fine.npz    more metaballs a limb, on the same surface
   kinefit body picture cyclist -o cyclist.png    an image of the body with its closures satisfied
 """)  # fmt: skip
 @click.pass_context
@@ -81,6 +82,23 @@ def check(file: str, planar: bool) -> None:
     if m.rank + m.mobility != m.open_dofs:
         _screen.say("the poses are singular: the rank admits directions without finite motion")
     check_closed(one)
+
+
+@body.command(short_help="Give every limb of metaballs more of them, on the same surface.")
+@click.argument("file")
+@click.option("--balls", type=click.IntRange(3, 40), default=8, show_default=True, help="Metaballs of each limb.")
+@click.option("-o", "--out", type=_screen.PATH, required=True, help="Saved body (.npz), for `body` of a take.")
+def refine(file: str, balls: int, out: Path) -> None:
+    """Refine a body of three metaballs a limb (a name, a body file, or motion.npz of a fit) to a fuller set."""
+    from kinefit.bodies import load_body
+    from kinefit.bodies.serial import save_body
+    from kinefit.readers.motion import read_motion
+    from kinefit.subject.metaballs import refined_body
+
+    _screen.check_file(out)
+    one = read_motion(file).body if Path(file).name == "motion.npz" or Path(file).is_dir() else load_body(file)
+    save_body(refined_body(one, balls), out)
+    _screen.say(f"{out}: {balls} metaballs a limb; name it in the take, body = \"{out}\"")
 
 
 @body.command(short_help="Render a body with its closures satisfied.")

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit.bodies import Body, BodyState, PointSet, TaperedCylinder
+from kinefit.bodies import Body, BodyState, KinematicTree, PointSet, TaperedCylinder
+from kinefit.bodies.closures import Closure
 from kinefit.correspondences import targets
-from kinefit.errors import BodyError, ObservationError
+from kinefit.errors import BodyError, ObservationError, check_choice
 from kinefit.rows import PairRows
 
 _DEFAULT_HALF_WIDTH = 0.05  # [m] of a joint between parts without cylinders: that of an elbow
+
+BAND = "band "
+"""How names of the closures and landmarks of `with_bands` begin."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +57,10 @@ def elliptic_bands(centre: ArrayLike, half_axes: ArrayLike, count: int = 4) -> N
 
 
 def joint_bands(
-    body: Body, *, elliptic: Collection[str] = ("neck",), along_line: int = 2, along_ellipse: int = 4
+    body: Body, *, elliptic: Collection[str] = ("neck",), along_line: int = 2, along_ellipse: int = 4,
+    joints: Collection[str] | None = None,
 ) -> Bands:
-    """Bands of all joints of a body: a fixed joint becomes elliptic, a revolute one a hinge, all others universal.
+    """Bands of joints of a body: a fixed joint becomes elliptic, a revolute one a hinge, all others universal.
 
     Parameters
     ----------
@@ -64,6 +69,7 @@ def joint_bands(
     elliptic : names of joints with three axes but a small range, which become elliptic too; unknown names are ignored.
     along_line, along_ellipse : int
         Number of bands of a hinge and of an elliptic joint.
+    joints : names of the joints that get bands; default: all.
 
     Raises
     ------
@@ -76,6 +82,8 @@ def joint_bands(
     tree = body.tree
     points, owners = [], []
     for s in range(1, len(tree.segments)):
+        if joints is not None and body.joints[s] not in joints:
+            continue
         turns = tree.axes[tree.dof_start[s] : tree.dof_start[s + 1]]
         if tree.prismatic[tree.dof_start[s] : tree.dof_start[s + 1]].any():
             raise BodyError("bands cannot have a sliding joint", place=body.joints[s], remedy="Give rotating joints.")
@@ -109,6 +117,61 @@ def band_rows(body: Body, state: BodyState, bands: Bands, *, sigma: ArrayLike = 
         Standard deviation of a band's extension.
     """
     return coincidence_rows(body, state, bands.parent, bands.child, sigma=sigma)
+
+
+def with_bands(body: Body, sigmas: Mapping[str, float]) -> Body:
+    """Replace joints of a body by elastic bands, see `joint_bands`: free joints, and soft closures between band ends.
+
+    The joint keeps its coordinates with their names and limits. It gets three slides, and the rotations that it lacks,
+    which only its bands constrain.
+
+    Parameters
+    ----------
+    sigmas : {name of a joint: standard deviation [m] of the extension of each of its bands}; "all" stands for every
+        joint that is not named and does not slide. A band's weight is 1 / sigma².
+
+    Raises
+    ------
+    BodyError
+        An unknown joint, or one that slides.
+    """
+    tree, closures = body.tree, list(body.closures)
+    sliding = {body.joints[s] for s in tree.owners[tree.prismatic].tolist()}
+    sigma = {joint: sigmas["all"] for joint in body.joints[1:] if joint not in sliding} if "all" in sigmas else {}
+    for joint in sigmas.keys() - {"all"}:
+        check_choice("joint", joint, body.joints[1:], BodyError, remedy='Name one of these, or "all".')
+        sigma[joint] = sigmas[joint]
+    bands = joint_bands(body, joints=sigma)
+    names = [f"{BAND}{name}" for name in bands.child.names]
+    for name, joint in zip(names, bands.joint):
+        closures.append(Closure(name, "point", f"{name} outer", f"{name} inner", sigma=sigma[body.joints[joint]]))
+    landmarks = PointSet(
+        (*body.landmarks.names, *(f"{name} outer" for name in names), *(f"{name} inner" for name in names)),
+        np.concatenate([body.landmarks.segments, bands.child.segments, bands.parent.segments]),
+        np.concatenate([body.landmarks.points, bands.child.points, bands.parent.points]),
+    )
+    for s in np.unique(bands.joint).tolist():
+        own = tree.axes[tree.dof_start[s] : tree.dof_start[s + 1]]
+        tree = _freed(tree, s, np.linalg.svd(own)[2][np.linalg.matrix_rank(own) :] if len(own) else np.eye(3))
+    return replace(body, tree=tree, landmarks=landmarks, closures=tuple(closures))
+
+
+def _freed(tree: KinematicTree, segment: int, turns: NDArray) -> KinematicTree:
+    """The tree with three slides before a joint's coordinates, and rotations about further axes (k, 3) after them."""
+    first, stop = int(tree.dof_start[segment]), int(tree.dof_start[segment + 1])
+    at = np.repeat([first, stop], [3, len(turns)])
+    names, k = list(tree.coordinates), len(at)
+    names[stop:stop] = [f"{tree.segments[segment]}_band_r{i + 1}" for i in range(len(turns))]
+    names[first:first] = [f"{tree.segments[segment]}_band_t{axis}" for axis in "xyz"]
+    added = {
+        "axes": np.concatenate([np.eye(3), turns]), "prismatic": np.arange(k) < 3, "lower": np.full(k, -np.inf),
+        "upper": np.full(k, np.inf), "usual": np.zeros(k), "spread": np.full(k, np.inf),
+    }  # fmt: skip
+    columns = {name: np.insert(getattr(tree, name), at, values, axis=0) for name, values in added.items()}
+    return replace(
+        tree, coordinates=tuple(names), owners=np.insert(tree.owners, at, segment),
+        couplings=np.insert(tree.couplings, at, 0.0, axis=1), **columns,
+    )  # fmt: skip
 
 
 def _section(body: Body, segment: int) -> NDArray:

@@ -19,6 +19,8 @@ from kinefit.photogrammetry.trajectories import Trajectories
 
 _MAX_IMAGE_SIDE_PX = 1400  # [px] of a picture's longer side
 _BAR = 90  # [px] of the scale beside it
+_MAX_PATHS = 200  # in a picture
+_ARROW_PX = 30.0  # [px] of the 95th percentile of a vector field's arrows
 
 
 def point_columns(
@@ -97,16 +99,8 @@ def write_field_picture(
     shown = surface.measured & np.isfinite(values)
     if not shown.any():
         raise ExportError("no measurement to show", file=path, remedy="Look at the correlations in the CSV file.")
-    scale = min(1.0, _MAX_IMAGE_SIDE_PX / max(image.shape))
-    low, high = np.percentile(image, (0.5, 99.5))
-    grey = np.clip((image - low) * (255.0 / max(high - low, 1e-9)), 0, 255).astype(np.uint8)
-    grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
-    bottom, top = np.percentile(values[shown], (1, 99))
-    span = max(top - bottom, 1e-12)
-    level = np.clip((values - bottom) / span, 0, 1)
-    level = np.where(shown, level, 0.0)
-    codes = cv2.applyColorMap((255 * level).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_VIRIDIS)[:, 0]
+    picture, scale = _backdrop(image)
+    codes, bottom, top = _coloured(values, shown)
     painted = picture.copy()
     uv = (surface.uv[:, 0] + 0.5) * scale - 0.5
     for triangle in surface.triangles:
@@ -115,6 +109,67 @@ def write_field_picture(
             cv2.fillConvexPoly(painted, np.rint(uv[triangle] * 8).astype(np.int32), colour, shift=3)
     picture = cv2.addWeighted(painted, 0.75, picture, 0.25, 0)
     write_image(path, np.hstack([picture, _scale(picture.shape[0], bottom, top, title, unit)]))
+
+
+def write_paths_picture(paths: Trajectories, view: int, image: NDArray, path: str | PathLike[str]) -> None:
+    """Draw paths over a camera's image, from dark (first frame) to bright (last one): PNG (P4 fig. 8).
+
+    Parameters
+    ----------
+    paths : with at least one point; of many, the `_MAX_PATHS` that exist in most frames are drawn
+    view : index of the camera
+    image : (H, W) grey values of that camera
+    """
+    picture, scale = _backdrop(image)
+    codes, first, last = _coloured(paths.times, np.ones(len(paths.times), bool))
+    longest = np.argsort(-paths.live.sum(axis=0), kind="stable")[:_MAX_PATHS]
+    uv = (paths.uv[:, longest, view] + 0.5) * scale - 0.5
+    for k in range(len(uv) - 1):
+        ways = np.stack([uv[k], uv[k + 1]], axis=1)
+        ways = np.rint(8 * ways[np.isfinite(ways).all(axis=(1, 2))]).astype(np.int32)
+        cv2.polylines(picture, list(ways), False, codes[k].tolist(), 2, cv2.LINE_AA, 3)
+    write_image(path, np.hstack([picture, _scale(len(picture), first, last, "time", "s")]))
+
+
+def write_velocity_picture(paths: Trajectories, frame: int, image: NDArray, path: str | PathLike[str]) -> bool:
+    """Draw the vector field of a frame over the first camera's image, coloured by speed: PNG (P4 fig. 9).
+
+    Arrows follow the points' motion in the image, the 95th percentile `_ARROW_PX` long. Returns whether a point moves.
+
+    Parameters
+    ----------
+    frame : index of the frame, neither the first nor the last
+    image : (H, W) grey values of the first camera in that frame
+    """
+    picture, scale = _backdrop(image)
+    uv, flow = paths.uv[frame, :, 0], paths.uv[frame + 1, :, 0] - paths.uv[frame - 1, :, 0]
+    shown, length = np.isfinite(flow + uv).all(axis=1), np.linalg.norm(flow, axis=1)
+    if not length[shown].any():
+        return False
+    codes, bottom, top = _coloured(np.linalg.norm(paths.velocity[frame], axis=1), shown)
+    starts = (uv + 0.5) * scale - 0.5
+    tips = starts + _ARROW_PX / np.percentile(length[shown], 95) * flow
+    for p in np.flatnonzero(shown):
+        start, tip = (tuple(np.rint(8 * at[p]).astype(int).tolist()) for at in (starts, tips))
+        cv2.arrowedLine(picture, start, tip, codes[p].tolist(), 1, cv2.LINE_AA, 3, 0.3)
+    write_image(path, np.hstack([picture, _scale(len(picture), bottom, top, "speed", "m/s")]))
+    return True
+
+
+def _backdrop(image: NDArray) -> tuple[NDArray, float]:
+    """An image (H, W) in grey as (h, w, 3), at most `_MAX_IMAGE_SIDE_PX` wide or high, and its scale."""
+    scale = min(1.0, _MAX_IMAGE_SIDE_PX / max(image.shape))
+    low, high = np.percentile(image, (0.5, 99.5))
+    grey = np.clip((image - low) * (255.0 / max(high - low, 1e-9)), 0, 255).astype(np.uint8)
+    grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), scale
+
+
+def _coloured(values: NDArray, shown: NDArray) -> tuple[NDArray, float, float]:
+    """Colours (N, 3) of values (N,), and the 1st and 99th percentile of those shown (N,) bool, where colours end."""
+    bottom, top = np.percentile(values[shown], (1, 99)).tolist()
+    level = np.where(shown, np.clip((values - bottom) / max(top - bottom, 1e-12), 0, 1), 0.0)
+    return cv2.applyColorMap((255 * level).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_VIRIDIS)[:, 0], bottom, top
 
 
 def write_paths_csv(paths: Trajectories, path: str | PathLike[str]) -> None:

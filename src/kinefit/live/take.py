@@ -32,7 +32,7 @@ from kinefit.readers.take.depth import stated_camera
 from kinefit.readers.take.entries import CameraEntry, DepthEntry, Take
 from kinefit.readers.take.load import load_observations
 from kinefit.takes.missing import find_cameras, last_found
-from kinefit.takes.track import settings_of, trial_of
+from kinefit.takes.track import settings_of, trial_of, with_bands_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import tracker_of
 from kinefit.tracking.take_recording import posed_start, recording_of
@@ -65,7 +65,7 @@ def live_session(
     """
     placed = last_found(take) if streams_of(take) else find_cameras(take, tell=tell)
     take = replace(take, cameras=placed.cameras, calibration=placed.calibration)
-    body = load_body(take.body) if take.start is None else read_motion(take.start).body
+    body = with_bands_of(take, load_body(take.body) if take.start is None else read_motion(take.start).body)
     threads = threads or cores()
     if streams_of(take):
         opened = opened_streams(take, body, threads, tell)

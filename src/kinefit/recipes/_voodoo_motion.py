@@ -7,8 +7,13 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.correspondences.bands import Bands
+from kinefit.geometry import se3
 from kinefit.recipes import _voodoo_steps as steps
 from kinefit.solvers.rigid_clusters import absolute_orientation, move
+
+_RANGE_LEVER = 0.1  # [m] from a joint to the points that show a limb's orientation
+_ANGLE_STEPS = 6  # of Newton's method from the default angles
+_MIN_EXCESS = 1e-3  # [rad] beyond a range that is corrected
 
 
 def band_ends(body: Body, frames: NDArray, bands: Bands) -> tuple[NDArray, NDArray]:
@@ -41,6 +46,45 @@ def band_pairs(
         steps.Pairs(ends[0], middle, own, bands.parent.segments),
         steps.Pairs(ends[1], middle, other, bands.child.segments),
     )
+
+
+def range_pairs(body: Body, frames: NDArray, weight: float) -> steps.Pairs:
+    """Artificial correspondences of limbs beyond their joint's range (P2 6).
+
+    Each axis of a limb about its joint is paired with where the nearest valid angles have it, seen from the parent.
+    """
+    tree, R = body.tree, frames[:, :9].reshape(-1, 3, 3)
+    out = [steps.Pairs(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0, np.int64))]
+    for s in range(1, len(frames)):
+        own = slice(int(tree.dof_start[s]), int(tree.dof_start[s + 1]))
+        if tree.prismatic[own].any():
+            continue
+        above = R[tree.parents[s]]
+        angles = rotation_angles(tree.axes[own], above.T @ R[s], tree.usual[own])
+        valid = np.clip(angles, tree.lower[own], tree.upper[own])
+        if np.abs(valid - angles).max(initial=0.0) > _MIN_EXCESS:
+            joint = R[s] @ tree.rest[s] + frames[s, 9:]
+            ends, targets = _RANGE_LEVER * R[s].T, _RANGE_LEVER * (above @ _turned(tree.axes[own], valid)[-1]).T
+            out.append(steps.Pairs(joint + ends, joint + targets, np.full(3, weight), np.full(3, s)))
+    return steps.joined(*out)
+
+
+def rotation_angles(axes: NDArray, R: NDArray, start: NDArray) -> NDArray:
+    """Angles (k,) [rad] about axes (k, 3), one after the other, that come nearest to a rotation R (3, 3)."""
+    angles = np.array(start, float)
+    for _ in range(_ANGLE_STEPS if len(axes) else 0):
+        before = _turned(axes, angles)
+        moves = np.stack([before[k] @ axis for k, axis in enumerate(axes)], axis=1)
+        angles += np.linalg.lstsq(moves, se3.log_so3(R @ before[-1].T), rcond=None)[0]
+    return angles
+
+
+def _turned(axes: NDArray, angles: NDArray) -> list[NDArray]:
+    """Rotations (3, 3) before each of k axes, and after the last."""
+    out = [np.eye(3)]
+    for axis, angle in zip(axes, angles):
+        out.append(out[-1] @ se3.exp_so3(axis * angle))
+    return out
 
 
 def moved(

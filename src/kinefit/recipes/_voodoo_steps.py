@@ -21,6 +21,14 @@ class Pairs(NamedTuple):
     limb: NDArray
 
 
+class LimbFit(NamedTuple):
+    """Result of one frame: frames (S, 12) of the limbs, the mean squared distance [m²], and the number of steps."""
+
+    frames: NDArray
+    quality: float
+    steps: int
+
+
 def fewer(member: NDArray, *, factor: float, minimum: int, maximum: int) -> tuple[NDArray, NDArray]:
     """Step 3: downsample candidates (N, S) bool for each limb: point (M,) and limb (M,) of those kept."""
     kept = [downsample(np.flatnonzero(m), factor=factor, minimum=minimum, maximum=maximum) for m in member.T]

@@ -1,5 +1,7 @@
 """Track unlabelled markers: identify each frame, and fit the body to it without a given pose (P5 5, tracking).
 
+`sapm_take` labels every frame of a take by SAPM as published, with the same result as `identify_take`.
+
 A tracker with input from `name_frame` initialises in the first sufficient frame, and again when it is lost, because
 each frame is identified by itself. `start_from_markers` is the initialisation alone.
 """
@@ -9,14 +11,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kinefit._arguments import checked
 from kinefit.bodies import BodyState
 from kinefit.bodies.marker_sets import bare
-from kinefit.errors import TrackingError
+from kinefit.errors import ObservationError, TrackingError
 from kinefit.identification.frame.identify import IdentifySettings, identify
 from kinefit.identification.model.model import MarkerModel
+from kinefit.identification.take.naming import Step
+from kinefit.identification.take.takes import TakeIdentification, TakeSettings, judge_labels
 from kinefit.initialization.from_points import pose_from_points
 from kinefit.markers.subject import MarkerSubject
-from kinefit.observations import MarkerFrame
+from kinefit.observations import MarkerFrame, Markers
+from kinefit.recipes.sapm import sapm
 
 MAX_START_ERROR = 0.05
 """[m] median distance of labelled markers from the body in an initial pose."""
@@ -71,3 +77,45 @@ def start_from_markers(subject: MarkerSubject, model: MarkerModel, points: Array
             f"no pose fits the markers: they are {1e3 * error:.0f} mm off", remedy="Use model and body of one subject."
         )
     return state
+
+
+@checked
+def sapm_take(
+    model: MarkerModel, markers: Markers, *, settings: TakeSettings | None = None, progress: Step | None = None,
+    epsilon: float = 0.1, beta: float = 0.8,
+) -> TakeIdentification:
+    """Label all points of a take by `sapm`, every frame anew.
+
+    The paper states no probability of a match. So confidence and doubts come only from the distances of each label to
+    its neighbours, as in `identify_take`.
+
+    Parameters
+    ----------
+    settings : gaps to fill and the least confidence without doubt; its anchors are not used
+    progress : (what, done, total) -> None
+    epsilon, beta : see `sapm`
+
+    Raises
+    ------
+    ObservationError
+        No frame has a match.
+    """
+    settings = settings or TakeSettings()
+    column = np.full((len(markers), len(model)), -1)
+    visible = np.isfinite(markers.positions).all(-1)
+    for f in range(len(markers)):
+        seen = np.flatnonzero(visible[f])
+        match = sapm(model, markers.positions[f, seen], epsilon=epsilon, beta=beta)
+        column[f] = np.where(match >= 0, np.append(seen, -1)[match], -1)
+        if progress is not None:
+            progress("matching", f + 1, len(markers))
+    if (column < 0).all():
+        raise ObservationError(
+            f"SAPM matches no segment of {model.name} in any frame", file=markers.source or None,
+            remedy="Check that subject, markers and unit are the same; with missing points lower beta.",
+        )
+    at = np.where((column >= 0)[..., None], markers.positions[np.arange(len(markers))[:, None], column], np.nan)
+    everywhere = tuple(range(len(markers)))
+    return judge_labels(
+        model, at, column, np.ones(column.shape), markers.rate, settings, everywhere, int(visible.sum())
+    )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from kinefit.recipes import _voodoo_boxes as boxing
 from kinefit.recipes import _voodoo_motion as motion
 from kinefit.recipes import _voodoo_steps as steps
 from kinefit.recipes._voodoo_input import Sight, near_body, sight_of
+from kinefit.recipes._voodoo_steps import LimbFit
 
 _MAX_MOTION = 0.5  # [m] of a limb from frame to frame
 _HANDS = ("l_wrist", "r_wrist", "l_metacarpal_phalanx_3", "r_metacarpal_phalanx_3")
@@ -46,6 +47,8 @@ class Settings:
     band : float
         Weight of each band; with the rule "points", of all bands of a limb relative to its points (at least `minimum`).
     band_rule : "each" or "points"
+    ranges : float
+        Weight of artificial correspondences that pull a limb back into the range of its joint (P2 6); default: none.
     floor : (4,) plane a, b, c, d with a x + b y + c z = d [m], optional
         Free points less than `clear` [m] above it are ignored.
     down : bool
@@ -69,6 +72,7 @@ class Settings:
     bound: float = 0.15
     band: float = 30.0
     band_rule: Literal["each", "points"] = "each"
+    ranges: float = 0.0
     floor: tuple[float, float, float, float] | None = None
     clear: float = 0.05
     down: bool = True
@@ -76,14 +80,6 @@ class Settings:
     quality: float = 0.005**2
     stop: float | None = None
     steps: tuple[int, int] = (0, 15)
-
-
-class LimbFit(NamedTuple):
-    """Result of one frame: frames (S, 12) of the limbs, the mean squared distance [m²], and the number of steps."""
-
-    frames: NDArray
-    quality: float
-    steps: int
 
 
 def voodoo(
@@ -124,8 +120,9 @@ def fit_frame(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, ba
 
 
 def _measured(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, s: Settings) -> steps.Pairs:
-    """Steps 1 to 5: pairs of all measurements with points of the limbs."""
+    """Steps 1 to 5: pairs of all measurements with points of the limbs, and of ranges where they have a weight."""
     return steps.joined(
+        *([motion.range_pairs(body, frames, s.ranges)] if s.ranges else []),
         _points(body, frames, sight, boxes, s),
         steps.points_on_points(body, frames, sight.points, sight.places, sight.places_weight),
         steps.points_on_lines(body, frames, sight.features, sight.lines, sight.lines_weight),

@@ -27,6 +27,8 @@ _MAX_ITERATIONS = 30
 _TOLERANCE = 1e-10  # share of the cost that a step must be predicted to lower it by
 _MAX_POINT_DISTANCE = 0.2  # [m] of a point from the surface
 _MIN_RADIUS_RATIO = 0.2  # to the radius at the start: a smaller ball has collapsed
+_REFINED_SIGMAS = (0.02, 0.001)  # [m] of the old surface: at first no part of it counts as an outlier
+_MAX_REFINED_RMS = 0.001  # [m] between the surfaces of few and of many balls
 
 ROUNDS = 30, (1, 5)
 """Rounds and `coarse` with which `fit_subject` fits radii of metaballs: points are matched again after every step.
@@ -178,6 +180,51 @@ def fit_balls(
     )  # fmt: skip
     found = grown(limb, theta, weights=weights)
     return BallFit(found, np.sqrt(np.diag(np.linalg.inv(H + np.diag(prior)))), float(np.sqrt(np.mean(r * r))), tried)
+
+
+def refined(limb: Metaballs, count: int) -> Metaballs:
+    """The same surface by more balls: `count` evenly from the first to the last, with radii fitted to the limb's mesh.
+
+    A fit with three balls a limb determines the pose, the full set then the shape (P4 3.3).
+
+    Raises
+    ------
+    BodyError
+        No more balls than the limb has, or a limb of one ball, which states no line.
+    """
+    old = len(limb.centres)
+    if not 1 < old < count:
+        problem = f"{count} balls in place of {old}"
+        raise BodyError(problem, remedy="Give more balls than the limb has, of which there are two or more.")
+    at = np.linspace(0.0, old - 1.0, count)
+    of, share = np.minimum(at.astype(int), old - 2), (at - np.minimum(at.astype(int), old - 2))[:, None]
+    centres, radii = ((1.0 - share) * v[of] + share * v[of + 1] for v in (limb.centres, limb.radii))
+    axes = limb.axes[np.rint(at).astype(int)]
+    along = np.argmax(np.abs(axes @ (centres[-1] - centres[0])), axis=1)
+    radii[np.arange(count), along] *= old / count
+    fine = Metaballs.of(limb.segment, centres, radii, None, axes)
+    for sigma in _REFINED_SIGMAS:
+        found = fit_balls(fine, limb.vertices, sigma, girth=1.0)
+        fine = found.limb
+    if found.rms > _MAX_REFINED_RMS:
+        problem = f"{count} balls do not make the limb's surface: {1e3 * found.rms:.1f} mm off"
+        raise BodyError(problem, remedy="Give another number of balls.")
+    return fine
+
+
+def refined_body(body: Body, count: int) -> Body:
+    """The body with `count` metaballs on every limb that has fewer, see `refined`.
+
+    Raises
+    ------
+    BodyError
+        No limb has metaballs that can be refined to so many.
+    """
+    found = [s for s in body.surfaces if isinstance(s, Metaballs) and 1 < len(s.centres) < count]
+    if not found:
+        problem = f"body '{body.name}' has no limb of two or more, and fewer than {count}, metaballs"
+        raise BodyError(problem, remedy="Give a body of metaballs, such as humanoid_metaballs, and more balls.")
+    return replace(body, surfaces=tuple(refined(s, count) if s in found else s for s in body.surfaces))
 
 
 def fit_field(

@@ -8,10 +8,11 @@ from os import PathLike
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit.bodies import load_body
+from kinefit.bodies import Body, load_body
+from kinefit.correspondences.bands import BAND, with_bands
 from kinefit.diagnostics.images import load_uncovered
 from kinefit.diagnostics.quick import input_findings, with_cause, with_findings
-from kinefit.errors import KinefitError, TakeError, command
+from kinefit.errors import KinefitError, TakeError, command, located
 from kinefit.identification.take.takes import with_names
 from kinefit.motion import Motion
 from kinefit.readers.calibration.read import found_notes
@@ -84,6 +85,7 @@ def track_take(
             f"body is {take.body}, but the motion of start has the body {body.name}",
             file=take.path, place="[take] start", remedy="Leave out body, or start from a motion of this body.",
         )  # fmt: skip
+    body = with_bands_of(take, body)
     with naming_plugins(((one.recording.sensor, one.kind) for one in seen.sensors), take.path):
         recording, body = recording_of(take, seen, body, view.people if view else None)
         settings = settings_of(take, settings)
@@ -137,6 +139,14 @@ def _without_keypoints(take: Take, more: str = "") -> TakeError:
     return TakeError(f"the take has no [[keypoints]]{more}", file=take.path, remedy=remedy)
 
 
+def with_bands_of(take: Take, body: Body) -> Body:
+    """The body with the elastic bands that a take names; a body that has bands (of `start`) keeps them."""
+    if take.bands is None or any(closure.name.startswith(BAND) for closure in body.closures):
+        return body
+    with located(take.path, "[take] bands"):
+        return with_bands(body, take.bands)
+
+
 def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
     """The person as another trial shows it, where a take names one (`subject`); TakeError for one of another body."""
     if take.subject is None:
@@ -147,7 +157,7 @@ def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
             f"the take of subject has the body {trial.body}, this take {take.body}", file=take.path,
             place="[take] subject", remedy="Write the same body into both takes.",
         )
-    seen, body = load_keypoints(trial), load_body(take.body)
+    seen, body = load_keypoints(trial), with_bands_of(take, load_body(take.body))
     assert seen.rig is not None
     sigma, cameras = [entry.sigma for entry in trial.keypoints], settings_of(trial).camera_errors
     of_person = Recording.of_keypoints(seen.rig, seen.keypoints, sigma=sigma, person=trial.person)

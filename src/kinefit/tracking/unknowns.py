@@ -159,7 +159,7 @@ def of_all(
     steps, states : what was measured at some poses of the body, which tell where gear and sensors' unknowns begin
     """
     found: list[tuple[Parameters, NDArray]] = []
-    if size and lengths and (surfaces or recording.markers):
+    if size and lengths and (surfaces or recording.markers or any(s.places_points for s in recording.sensors)):
         found.append((_size_by_network(body, recording), np.zeros(len(body.scale_groups))))
     if size and surfaces:
         found += [(shape, shape.mean) for shape in shape_of(body)]

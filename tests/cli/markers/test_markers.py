@@ -61,6 +61,35 @@ def test_points_get_their_labels_back(folder, subject):
     assert ("doubtful frames: none" in text) == (not rows)
 
 
+def test_labels_by_sapm_as_published(folder, subject, tmp_path):
+    take = read_markers(folder / "points.c3d")
+    x = np.array(take.positions[:8])
+    x[3], x[5, 4:9] = np.nan, np.nan
+    write_markers(replace(take, positions=x, residual=None), tmp_path / "short.c3d")
+    words = ("identify", tmp_path / "short.c3d", subject, "--method", "sapm", "--no-fill")
+    code, text = call(*words, "-o", tmp_path / "sapm.c3d")
+    assert code == 0, text
+    truth, named = read_markers(folder / "labelled.c3d"), read_markers(tmp_path / "sapm.c3d")
+    at = named.positions[:, [named.names.index(n) for n in truth.names]]
+    assert np.isnan(at[3]).all()
+    right = np.linalg.norm(at - truth.positions[:8], axis=-1) < 0.001
+    assert right[[0, 1, 2, 4, 6, 7]].mean() > 0.9
+    assert 0.4 < right[5].mean() < right[4].mean()  # beta loses segments that lack a marker
+    assert (tmp_path / "sapm-doubts.csv").read_text().startswith("first_frame,last_frame")
+    code, _ = call(*words, "-o", tmp_path / "low.c3d", "--beta", 0.5)
+    lower = read_markers(tmp_path / "low.c3d")
+    lower = lower.positions[5, [lower.names.index(n) for n in truth.names]]
+    assert np.isfinite(lower[:, 0]).sum() > np.isfinite(at[5, :, 0]).sum()
+
+
+def test_settings_of_sapm_belong_to_sapm(folder, subject, tmp_path):
+    code, text = call("identify", folder / "points.c3d", subject, "--beta", 0.5)
+    assert code == 2 and "--method sapm" in text
+    write_markers(Markers(("a", "b"), 30.0, np.ones((3, 2, 3))), tmp_path / "two.c3d")
+    code, text = call("identify", tmp_path / "two.c3d", subject, "--method", "sapm")
+    assert code == 2 and "matches no segment of Anna" in text
+
+
 def test_learn_from_one_frame(folder, tmp_path):
     code, text = call("learn", folder / "labelled.c3d", "--frame", 3, "-o", tmp_path / "one.json")
     assert code == 0, text

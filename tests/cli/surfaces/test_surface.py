@@ -185,6 +185,12 @@ def test_videos_are_tracked(folder, tmp_path):
         rows = list(csv.DictReader(file))
     last = [row for row in rows if float(row["time_s"]) == pytest.approx(0.1)]
     assert len(last) > 30
+    for name, view in (("paths_a", "a"), ("paths_b", "b"), ("velocity", "a")):
+        picture = cv2.imread(str(out / f"{name}.png")).astype(int)
+        grey = cv2.imread(str(folder / view / "0.png"), cv2.IMREAD_GRAYSCALE)
+        assert picture.shape == (grey.shape[0], grey.shape[1] + 180, 3)
+        coloured = np.ptp(picture[:, : grey.shape[1]], axis=2) > 30
+        assert 0.002 < coloured.mean() < 0.5
     told = call(folder / "calib.toml", *views, "-o", out, "--gauge", 3)
     assert isinstance(told.exception, ObservationError) and "--gauge cannot be used with videos" in str(told.exception)
 
@@ -199,6 +205,7 @@ def test_bounds_and_neighbours_cut_paths_of_videos(folder, tmp_path):
     assert none.exit_code == 0 and ": 0 of " in none.output, none.output
     assert len((tmp_path / "wide" / "trajectories.csv").read_text().splitlines()) > 100
     assert len((tmp_path / "none" / "trajectories.csv").read_text().splitlines()) == 1
+    assert (tmp_path / "wide" / "velocity.png").exists() and not list((tmp_path / "none").glob("*paths*"))
     told = call(folder / "calib.toml", f"a={folder / 'a'}", f"b={folder / 'b'}", "-o", tmp_path, "--bounds", 1, 50)
     assert isinstance(told.exception, ObservationError) and "--bounds needs videos" in str(told.exception)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -23,7 +23,13 @@ from kinefit.identification.model.from_frame import model_from_frame
 from kinefit.identification.model.gate import TrainingFinding, training_gate
 from kinefit.identification.model.learn import learn_model
 from kinefit.identification.model.model import MarkerModel, load_model
-from kinefit.identification.take.takes import TakeIdentification, TakeSettings, identify_people, one_after_the_other
+from kinefit.identification.take.takes import (
+    TakeIdentification,
+    TakeSettings,
+    identify_people,
+    identify_take,
+    one_after_the_other,
+)
 from kinefit.markers.subject import MarkerSubject
 from kinefit.motion import Motion, rotation_between_up
 from kinefit.observations import Markers
@@ -108,6 +114,7 @@ def identify_file(
     unit: str | None = None,
     rest: bool = False,
     step: Step | None = None,
+    method: Callable[..., TakeIdentification] = identify_take,
 ) -> tuple[Markers, dict[str, TakeIdentification], dict[str, Path]]:
     """Name the markers of a file and write it with labels, with a table of doubtful frames beside it.
 
@@ -120,6 +127,7 @@ def identify_file(
         channels and parameters.
     unit : of files that state none or a wrong one
     rest : whether points that are unassigned are kept, as "*1", "*2" ...
+    method : labels one subject; called as `identify_take`
 
     Returns
     -------
@@ -139,7 +147,7 @@ def identify_file(
     given = [model] if isinstance(model, MarkerModel | str | PathLike) else list(model)
     models = [m if isinstance(m, MarkerModel) else load_model(m) for m in given]
     markers = read_file(source, unit)
-    found = identify_people(models, markers, settings=settings, progress=step)
+    found = identify_people(models, markers, settings=settings, progress=step, method=method)
     labelled = _together(models, found, markers, rest)
     both_c3d = source.suffix.lower() == target.suffix.lower() == ".c3d"
     write_markers(labelled, target, like=source if both_c3d else None)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -113,30 +114,44 @@ Examples:
   kinefit markers identify walk.c3d anna.json
   kinefit markers identify dance.c3d anna.json bob.json -o dance-named.c3d
   kinefit markers identify walk.trc anna.json --no-fill --rest
+  kinefit markers identify walk.c3d anna.json --method sapm --beta 0.6
 """)  # fmt: skip
 @click.argument("take", type=_screen.PATH)
 @click.argument("subjects", nargs=-1, required=True, type=_screen.PATH)
 @click.option("-o", "--out", type=_screen.PATH, help="Labelled take, .c3d or .trc.  [default: TAKE-named]")
 @click.option("--fill/--no-fill", default=True, show_default=True, help="Fill gaps of up to half a second.")
 @click.option("--rest", is_flag=True, help='Also write unassigned points, as "*1", "*2" ...')
+@click.option("--method", type=click.Choice(["identifier", "sapm"]), default="identifier", show_default=True,
+              help="The identifier, or the published SAPM for comparison: every frame anew, less reliable.")
+@click.option("--epsilon", type=click.FloatRange(0, 1, min_open=True), metavar="E",
+              help="SAPM: tolerated distortion, as a share of a segment's mean distance.  [default: 0.1]")
+@click.option("--beta", type=click.FloatRange(0, 1, max_open=True), metavar="B",
+              help="SAPM: share of a segment's points that a match must exceed.  [default: 0.8]")
 @_unit
 @_screen.verbose_option
 def identify(
-    take: Path, subjects: tuple[Path, ...], out: Path | None, fill: bool, rest: bool, unit: str | None
-) -> None:
+    take: Path, subjects: tuple[Path, ...], out: Path | None, fill: bool, rest: bool, method: str,
+    epsilon: float | None, beta: float | None, unit: str | None,
+) -> None:  # fmt: skip
     """Label the points of an unlabelled take.
 
     SUBJECTS are files of `kinefit markers learn`, one for each person in the take. Existing labels of the take are
     ignored. Points without a certain label stay unlabelled. The worst doubtful frames are printed; a table lists all.
     """
     from kinefit.cli.markers._fit import identify_file
-    from kinefit.identification.take.takes import TakeSettings
+    from kinefit.identification.take.takes import TakeSettings, identify_take
+    from kinefit.recipes.unlabelled_markers import sapm_take
 
+    given = (("epsilon", epsilon), ("beta", beta))
+    constants: dict[str, Any] = {name: value for name, value in given if value is not None}
+    if constants and method != "sapm":
+        raise click.UsageError(f"--{' and --'.join(constants)}: only for SAPM, add --method sapm.")
     settings = TakeSettings() if fill else TakeSettings(fill=0.0)
     with _screen.bars() as step:
         labelled, found, files = identify_file(
-            take, list(subjects), out, settings=settings, unit=unit, rest=rest, step=step
-        )
+            take, list(subjects), out, settings=settings, unit=unit, rest=rest, step=step,
+            method=partial(sapm_take, **constants) if method == "sapm" else identify_take,
+        )  # fmt: skip
     _tell(labelled, found)
     _screen.say("\nWritten:")
     _screen.say(f"  {files['markers']}  labelled markers")

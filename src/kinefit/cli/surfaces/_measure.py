@@ -21,10 +21,12 @@ from kinefit.exporters.surface_files import (
     point_columns,
     write_field_picture,
     write_paths_csv,
+    write_paths_picture,
     write_point_picture,
     write_points_csv,
     write_returns_csv,
     write_surface_vtk,
+    write_velocity_picture,
 )
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion
@@ -373,7 +375,7 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
         )  # fmt: skip
         seeds = None if wanted.seeds is None else read_seeds(wanted.seeds, len(rig))
         tracker = SurfaceTracker(rig, videos[0].rate, settings, mask_of(wanted.mask, wanted.field), seeds, motion)
-        lines = []
+        lines, middle = list[str](), list[SplineImage]()
         for k in range(count):
             images = [spline_of(video.read(k), wanted.field, wanted.smooth) for video in videos]
             try:
@@ -383,6 +385,7 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
                 break
             if k in (0, count // 2, count - 1):
                 write_point_picture(points.uv[:, 0], images[0].grey, wanted.out / f"points_{k:06d}.png")
+            middle = images if k == min(count // 2, max(count - 2, 0)) else middle
             progress("frames", k + 1, count)
     paths = tracker.trajectories()
     speed = float(np.nanpercentile(np.linalg.norm(paths.velocity, axis=2), 99)) if len(paths.times) > 1 else 0.0
@@ -392,6 +395,12 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
             paths, radius=_surroundings(paths), bounds=wanted.bounds, neighbours=wanted.neighbours
         )  # fmt: skip
     write_paths_csv(kept, wanted.out / "trajectories.csv")
+    if kept.live.any():
+        for view, (name, image) in enumerate(zip(views.names, middle)):
+            write_paths_picture(kept, view, image.grey, wanted.out / f"paths_{name}.png")
+        at = min(count // 2, count - 2)
+        if 0 < at < len(kept.times) - 1:
+            write_velocity_picture(kept, at, middle[0].grey, wanted.out / "velocity.png")
     if motion is not None:
         write_returns_csv(tracker.returns(), motion.rate, wanted.out / "returns.csv")
     live, before = kept.live.sum(axis=1), int(paths.live.any(axis=0).sum())

@@ -16,7 +16,7 @@ from kinefit.findings import runs_of
 from kinefit.identification.frame.beliefs import Beliefs, Identification
 from kinefit.identification.frame.identify import IdentifySettings, identify
 from kinefit.identification.model.model import MarkerModel, load_model
-from kinefit.identification.take.consistency import fill_gaps
+from kinefit.identification.take.consistency import Consistency, fill_gaps
 from kinefit.identification.take.naming import INLIER_SIGMAS, OUTLIER_SIGMAS, Naming, Step
 from kinefit.identification.take.votes import find_pieces
 from kinefit.observations import Markers
@@ -202,20 +202,37 @@ def _anchors(counts: NDArray, every: int) -> list[int]:
 def _result(work: Naming, rate: float, settings: TakeSettings) -> TakeIdentification:
     """The result, with gaps filled and doubts listed."""
     positions, point = work.positions()
-    visible = point >= 0
-    misfits = work.consistency.own(positions)
-    vote_confidence = work.confidence[work.pieces.piece][point]
+    column = np.where(point >= 0, work.pieces.column[point], -1)
+    votes = work.confidence[work.pieces.piece][point]
+    anchors = tuple(sorted(work.votes.asked))
+    return judge_labels(work.model, positions, column, votes, rate, settings, anchors, len(work.pieces.points))
+
+
+def judge_labels(
+    model: MarkerModel, positions: NDArray, column: NDArray, probability: NDArray, rate: float, settings: TakeSettings,
+    anchors: tuple[int, ...], points: int,
+) -> TakeIdentification:
+    """Judge labels by the distances within the body: confidence, doubts, filled gaps.
+
+    Parameters
+    ----------
+    positions : (F, M, 3) [m] of the labels; NaN where not visible or unknown
+    column : (F, M) column of the take that each label comes from; -1 for none
+    probability : (F, M) of each label before its distances are compared, 0 to 1
+    rate : [Hz]
+    anchors : frames that were identified separately
+    points : number of points of the take
+    """
+    visible = column >= 0
+    misfits = Consistency(model).own(positions)
     fit_factor = np.exp(-0.5 * np.clip(np.nan_to_num(misfits) - INLIER_SIGMAS, 0.0, None) ** 2 / INLIER_SIGMAS**2)
-    confidence = np.where(visible, vote_confidence * fit_factor, 0.0)
-    doubts = list_doubts(work.model.labels, confidence, misfits, visible, settings.certain)
+    confidence = np.where(visible, probability * fit_factor, 0.0)
+    doubts = list_doubts(model.labels, confidence, misfits, visible, settings.certain)
     filled = np.zeros(visible.shape, bool)
     if settings.fill > 0:
-        positions, filled = fill_gaps(work.model, positions, rate, settings.fill, settings.fill_alone)
-    column = np.where(visible, work.pieces.column[point], -1)
-    return TakeIdentification(
-        work.model.labels, positions, confidence, filled, column, tuple(doubts), tuple(sorted(work.votes.asked)),
-        int(len(work.pieces.points) - visible.sum()),
-    )
+        positions, filled = fill_gaps(model, positions, rate, settings.fill, settings.fill_alone)
+    ghosts = int(points - visible.sum())
+    return TakeIdentification(model.labels, positions, confidence, filled, column, tuple(doubts), anchors, ghosts)
 
 
 def list_doubts(
@@ -296,7 +313,7 @@ def with_names(take: Take, seen: Observations, *, progress: Step | None = None) 
 @checked
 def identify_people(
     models: Sequence[MarkerModel], markers: Markers, *, settings: TakeSettings | None = None,
-    progress: Step | None = None,
+    progress: Step | None = None, method: Callable[..., TakeIdentification] = identify_take,
 ) -> list[TakeIdentification]:
     """Label several subjects in one take, one after the other, the one with most markers first.
 
@@ -308,6 +325,7 @@ def identify_people(
     markers : (F, N, 3) [m], unlabelled or wrongly labelled
     settings : default: `TakeSettings()`
     progress : (what, done, total) -> None
+    method : labels one subject; called as `identify_take`
 
     Returns
     -------
@@ -326,7 +344,7 @@ def identify_people(
     remaining = np.array(markers.positions)
     out: dict[int, TakeIdentification] = {}
     for i in sorted(range(len(models)), key=lambda i: -len(models[i])):
-        out[i] = identify_take(models[i], replace(markers, positions=remaining), settings=settings, progress=progress)
+        out[i] = method(models[i], replace(markers, positions=remaining), settings=settings, progress=progress)
         column, is_certain = out[i].column, out[i].confidence >= settings.certain
         rows = np.broadcast_to(np.arange(len(column))[:, None], column.shape)
         remaining[rows[is_certain], column[is_certain]] = np.nan

@@ -44,6 +44,7 @@ _Angle = Annotated[float, Meta(ge=0, lt=30, description="Give degrees below 30: 
 _View = Annotated[float, Meta(ge=5, le=150, description="Give degrees from 5 to 150.")]
 _Stature = Annotated[float, Meta(gt=0.3, lt=3, description="Give the stature in metres, or remove it.")]
 _Disparity = Annotated[float, Meta(gt=0, lt=100, description="Give a positive number of pixels.")]
+_BandSigma = Annotated[float, Meta(gt=0, lt=1, description="Give the standard deviation of a band in metres: 0.005.")]
 _Step = Annotated[int, Meta(gt=-(10**9), lt=10**9, description="Give [first, one after the last].")]
 _Counted = Annotated[
     int, Meta(ge=0, lt=10**9, description="Give [first, one after the last], counted from 0, for every range.")
@@ -264,6 +265,8 @@ class TakeHead:
         Vertical axis of the calibration's (or markers') world.
     body : str
         Name in the catalogue, or absolute path of a body file.
+    bands : {joint: float [m]} or None
+        Joints by elastic bands in place of hard ones, see `correspondences.bands.with_bands`; "all": all others.
     height : float [m] or None
         Stature of the person, as a first guess.
     person : int, str or None
@@ -284,6 +287,7 @@ class TakeHead:
     rate: Rate | None = None
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
     body: str = "humanoid"
+    bands: dict[str, _BandSigma] | None = None
     height: _Stature | None = None
     person: int | str | None = None
     subject: Path | None = None
