@@ -121,7 +121,8 @@ def _joined(
     shown = [video.frame_at(t) for t in motion.times - motion.times[0]]
     numbers = [k for k in shown if k is not None]
     if len(numbers) < len(shown):
-        problem = f"the video ends at {video.times[-1]:.2f} s, the motion lasts {motion.times[-1] - motion.times[0]:.2f} s"
+        lasting = motion.times[-1] - motion.times[0]
+        problem = f"the video ends at {video.times[-1]:.2f} s, the motion lasts {lasting:.2f} s"
         raise ObservationError(problem, file=video.path, remedy="Give a video of the same time, such as an overlay.")
     width = 2 * round(0.5 * size[1] * video.size[0] / video.size[1])
     scaled = (cv2.resize(video.read(k)[..., ::-1], (width, size[1]), interpolation=cv2.INTER_AREA) for k in numbers)

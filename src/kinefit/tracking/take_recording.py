@@ -279,7 +279,8 @@ def _motion_poses(take: Take, body: Body, seen: Observations) -> dict[int, BodyS
         )  # fmt: skip
     steps = seen.frames[1] - seen.frames[0]
     if take.size and (len(motion) != steps or not np.isclose(motion.rate, seen.rate, rtol=1e-3)):
-        problem = f"the motion of start has {len(motion)} frames at {motion.rate:g} Hz, this take {steps} at {seen.rate:g}"
+        problem = f"the motion of start has {len(motion)} frames at {motion.rate:g} Hz, "
+        problem += f"this take {steps} at {seen.rate:g} Hz"
         remedy = "Start from a motion of this very take, or leave out size = true."
         raise TakeError(problem, file=take.path, place="[take] start", remedy=remedy)
     roots = motion.Ts_world_root
