@@ -104,7 +104,7 @@ def film(
         raise ExportError("videos are written only as .mp4", file=path, remedy=f"Write to {target.stem}.mp4.")
     lines, (up, _, R) = _lines(motion, slope, heading), _inclined(motion, slope, heading)
     cameras = enumerate(_cameras(motion, heading, azimuth, size))
-    images = (draw_figure(motion, frame, camera, _backdrop(camera, lines, R @ up)) for frame, camera in cameras)
+    images: Iterator[NDArray] = (draw_figure(motion, frame, camera, _backdrop(camera, lines, R @ up)) for frame, camera in cameras)
     if beside is not None:
         images, size = _joined(motion, Video(beside, rate=motion.rate), images, size)
     try:

@@ -90,7 +90,9 @@ class Morphing:
         for o, s in motions:
             self._motions.setdefault(s, []).append(o)
         self._fields: list[tuple[Steering, NDArray]] = []
-        self._bulges: list[tuple[LocalMorph, NDArray, NDArray, int | None]] = []  # at rest, nodes, shares, carrier
+        # Bulges of one function r, at rest, that act together; nodes, their shares, and the segment that carries them.
+        self._bulges: list[tuple[list[LocalMorph], NDArray, NDArray, int | None]] = []
+        together: dict[object, list[LocalMorph]] = {}
         for o in self.operators:
             if isinstance(o, GlobalMorph):
                 self._fields.append((o.steering, o.field(x, parameters)))
@@ -98,8 +100,12 @@ class Morphing:
                 self._fields.append((o.steering, self._segment_field(o)))
             elif isinstance(o, LocalMorph) and (o.moves or o.deforms):
                 carrier, share = tree.segment(str(o.segment)) if o.moves else None, self._node_shares(o)[:, 0]
-                nodes = np.flatnonzero(share)
-                self._bulges.append((o.placed(tree), nodes, share[nodes], carrier))
+                one = (carrier, o.on, *(np.asarray(v, float).tobytes() for v in (o.centre, o.radii, o.tilt)))
+                bulges = together.setdefault(id(o) if o.deforms else one, [])
+                bulges.append(o.placed(tree))
+                if len(bulges) == 1:
+                    nodes = np.flatnonzero(share)
+                    self._bulges.append((bulges, nodes, share[nodes], carrier))
             elif isinstance(o, LocalMorph):
                 self._fields.append((o.steering, self._node_shares(o) * o.placed(tree).field(x, parameters)))
         above = np.eye(len(tree.segments), dtype=bool)
@@ -209,32 +215,33 @@ class Morphing:
         for steering, field in self._fields:
             if weight := self._weight_of(steering, state)[1]:
                 shift = weight * field if shift is None else shift + weight * field
-        for bulge, nodes, share, bone in self._bulges:
-            if weight := self._weight_of(bulge.steering, state)[1]:
+        for bulges, nodes, share, bone in self._bulges:
+            weights = [self._weight_of(bulge.steering, state)[1] for bulge in bulges]
+            if any(weights):
                 shift = np.zeros_like(self.skin.vertices) if shift is None else shift
-                _, y, along, back = self._carried(bulge, nodes, bone, frames)
-                shift[nodes] += (weight * share * bulge.value(y, weight))[:, None] * (along @ back)
+                _, y, along, back = self._carried(bulges, nodes, bone, frames)
+                shift[nodes] += (share * bulges[0].value(y, weights[0]))[:, None] * (weights @ along @ back)
         return MorphedPose(self, state, frames, screws, shift, tuple(drives))
 
     def _carried(
-        self, bulge: LocalMorph, nodes: NDArray, bone: int | None, frames: NDArray
+        self, bulges: Sequence[LocalMorph], nodes: NDArray, bone: int | None, frames: NDArray
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """A bulge that moves with a bone, r(y) of nodes y in the bone's frame in this pose, or that deforms.
+        """Bulges that move with a bone, r(y) of nodes y in the bone's frame in this pose, or that deform.
 
         A node x at rest on segment n has y = T_bone⁻¹ T_n x, and is shifted by s r(y, s) R_nᵀ R_bone d. Without a bone
         y = x, and the shift is s r(x, s) d.
 
         Returns
         -------
-        T_n x (k, 3) [m], y (k, 3) [m], R_bone d (3,) [m], and R_n, (k, 3, 3) or (3, 3).
+        T_n x (k, 3) [m], y (k, 3) [m], R_bone d (b, 3) [m] of each bulge, and R_n, (k, 3, 3) or (3, 3).
         """
-        x, shift = self.skin.vertices[nodes], np.asarray(bulge.shift, float)
+        x, shifts = self.skin.vertices[nodes], np.array([bulge.shift for bulge in bulges], float)
         if bone is None:
-            return x, x, shift, np.eye(3)
+            return x, x, shifts, np.eye(3)
         R, t = frames[:, :9].reshape(-1, 3, 3), frames[:, 9:]
         back = R[self.skin.segment[nodes]]
         at = np.einsum("vij,vj->vi", back, x) + t[self.skin.segment[nodes]]
-        return at, (at - t[bone]) @ R[bone], R[bone] @ shift, back
+        return at, (at - t[bone]) @ R[bone], shifts @ R[bone].T, back
 
     def _slopes(self, pose: MorphedPose) -> dict[int, NDArray]:
         """Derivatives (V, 3) of the nodes at rest by degrees of freedom; see `MorphedPose`.
@@ -254,15 +261,19 @@ class Morphing:
             if slope:
                 add(6 + d, slice(None), slope * field)
         R = pose.frames[:, :9].reshape(-1, 3, 3)
-        for bulge, nodes, share, bone in self._bulges:
-            d, weight, slope = self._weight_of(bulge.steering, pose.state)
-            if not weight and not slope:
+        for bulges, nodes, share, bone in self._bulges:
+            steered = [self._weight_of(bulge.steering, pose.state) for bulge in bulges]
+            weights = [weight for _, weight, _ in steered]
+            at, y, each, back = self._carried(bulges, nodes, bone, pose.frames)
+            by_point, by_weight = bulges[0].slopes(y, weights[0])
+            r, owner = share * bulges[0].value(y, weights[0]), self.skin.segment[nodes]
+            for (d, weight, slope), of_one in zip(steered, each):
+                if slope:
+                    add(6 + d, nodes, slope * (r + weight * share * by_weight)[:, None] * (of_one @ back))
+            if bone is None or not any(weights):
                 continue
-            at, y, along, back = self._carried(bulge, nodes, bone, pose.frames)
-            by_point, by_weight = bulge.slopes(y, weight)
-            r, owner = share * bulge.value(y, weight), self.skin.segment[nodes]
-            add(6 + d, nodes, slope * (r + weight * share * by_weight)[:, None] * (along @ back))
-            for n in [] if bone is None else np.unique(owner[r > _MIN_BULGE]):
+            along = weights @ each
+            for n in np.unique(owner[r > _MIN_BULGE]):
                 own = np.flatnonzero((owner == n) & (r > _MIN_BULGE))
                 apart = pose.segment_jacobian(int(n)) - pose.segment_jacobian(bone)
                 moving = np.flatnonzero(np.abs(apart).max(axis=0) > 0.0)
@@ -270,7 +281,7 @@ class Morphing:
                 rise = share[own, None] * by_point[own] @ R[bone].T  # of r, in the world
                 more = rise @ v + np.cross(at[own] - pose.state.T_world_root[:3, 3], rise) @ w
                 turned = r[own, None, None] * np.cross(w.T, along)
-                change = weight * (more[:, :, None] * along - turned) @ R[n]
+                change = (more[:, :, None] * along - turned) @ R[n]
                 for k, of_k in zip(moving, change.swapaxes(0, 1)):
                     add(int(k), nodes[own], of_k)
         return out

@@ -213,7 +213,7 @@ class LocalMorph:
         away, r = x - np.asarray(self.centre), self.value(x, weight)
         u = away @ axes
         pull = 2.0 * r[:, None] * u / radii**2
-        growing = u * np.log(self.stretch) + np.cross(self.turn, away) @ axes
+        growing = u * np.log(self.stretch) + np.cross(np.asarray(self.turn), away) @ axes
         return -pull @ axes.T, np.sum(pull * growing, axis=1)
 
     def _deformed(self, weight: float) -> tuple[NDArray, NDArray]:
