@@ -11,8 +11,9 @@ world origin costs no digits; row makers need not care, they give points in the 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -194,7 +195,9 @@ class DofRows:
 
     Parameters
     ----------
-    jacobian : (N, 6 + D) how far each point moves along its direction, by every degree of freedom.
+    by_dof : (N, 6 + D), or a function that returns it
+        `jacobian`: how far each point moves along its direction, by every degree of freedom. A function is called when
+        that is first needed: residuals alone do not need it.
     residual : (N,) [m] how much further along it each point should lie.
     weight : (N,) [1/m²]
     group : (N,) int
@@ -205,7 +208,7 @@ class DofRows:
         The segment that each point belongs to, for evidence and residuals; None where it is of several.
     """
 
-    jacobian: NDArray
+    by_dof: NDArray | Callable[[], NDArray]
     residual: NDArray
     weight: NDArray
     group: NDArray
@@ -213,11 +216,19 @@ class DofRows:
     segment: NDArray | None = None
 
     def __post_init__(self) -> None:
-        number, size = (float, (None,)), np.shape(self.jacobian)[1:]
-        _as_kernels_take_them(
-            self, residual=number, jacobian=(float, (None, *size)), weight=number, group=(np.int64, (None,))
-        )
-        _check("rows", self.jacobian, self.residual, self.weight)
+        number = float, (None,)
+        _as_kernels_take_them(self, residual=number, weight=number, group=(np.int64, (None,)))
+        _check("rows", self.residual, self.weight, *(() if callable(self.by_dof) else [self.jacobian]))
+
+    @cached_property
+    def jacobian(self) -> NDArray:
+        """(N, 6 + D) how far each point moves along its direction, by every degree of freedom."""
+        J = np.ascontiguousarray(self.by_dof() if callable(self.by_dof) else self.by_dof, float)
+        if J.ndim != 2 or len(J) != len(self):
+            wanted = (len(self), *J.shape[1:])
+            raise ObservationError(f"jacobian of DofRows has shape {J.shape}", remedy=f"Give {wanted}.")
+        _check("rows", J)
+        return J
 
     def __len__(self) -> int:
         return len(self.residual)

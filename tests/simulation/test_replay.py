@@ -9,6 +9,7 @@ from kinefit.cli import main
 from kinefit.errors import ExportError, ObservationError
 from kinefit.exporters.motion_file import write_motion
 from kinefit.readers.motion import read_motion
+from kinefit.simulation.figures import write_video
 from kinefit.simulation.movements import squat_and_wave
 from kinefit.simulation.replay import film, replayed
 
@@ -51,6 +52,28 @@ def test_a_film_shows_the_person_on_the_slope(motion, tmp_path):
     assert np.mean(np.abs(low - (226, 232, 240)).max(axis=1) < 12) > 0.5  # snow below, in RGB
     with pytest.raises(ExportError, match=r"\.mp4"):
         film(motion, tmp_path / "ride.gif")
+
+
+def test_the_scene_stands_beside_a_video_of_the_same_frames(motion, tmp_path):
+    """P1 figure 4: the estimate in a virtual scene beside the image, frame by frame."""
+    greys = 40 + 20 * np.arange(len(motion))  # frame k has one grey of its own
+    images = (np.full((120, 160, 3), grey, np.uint8) for grey in greys)
+    write_video(tmp_path / "camera.mp4", images, motion.rate, (160, 120))
+    write_motion(motion, tmp_path / "motion.npz")
+    run = lambda *words: CliRunner().invoke(main, ["replay", str(tmp_path / "motion.npz"), *words])
+    level = ["--slope", "0", "--speed", "0", "--beside", str(tmp_path / "camera.mp4")]
+    done = run("-o", str(tmp_path / "both.mp4"), *level)
+    assert done.exit_code == 0, done.output
+    with av.open(str(tmp_path / "both.mp4")) as video:
+        frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert len(frames) == len(motion) and frames[0].shape == (720, 960 + 960, 3)
+    shown = [f[:, 20:940].mean() for f in frames]
+    np.testing.assert_allclose(shown, greys, atol=8.0)  # two lossy encodings; the next frame is 20 off
+    assert all(f[:, 980:].std() > 10.0 for f in frames)  # sky, floor and person
+    assert run("-o", str(tmp_path / "both.npz"), *level).exit_code == 2
+    longer = squat_and_wave(rate=25.0, duration=2.0, up="z")
+    with pytest.raises(ObservationError, match=r"camera.mp4.*the video ends at"):
+        film(longer, tmp_path / "long.mp4", beside=tmp_path / "camera.mp4")
 
 
 def test_the_command_writes_motions_and_videos(motion, tmp_path):

@@ -15,8 +15,13 @@ from kinefit.rendering import Canvas
 from kinefit.rows import DofRows
 from kinefit.sensors.points.keypoints import KeypointSensor
 from kinefit.sensors.points.markers import MarkerSensor
+from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.solvers.bundle.border_frames import differences
+from kinefit.subject.matched_frames import MatchedFrames, Worlds
+from kinefit.subject.parameters import World
+from kinefit.subject.surfaces import CylinderShape
 from kinefit.tracking.tracker import Tracker
 
 JOINTS = ("arm_flex_r", "arm_add_r", "arm_flex_l", "elbow_flex_r")
@@ -129,3 +134,33 @@ def test_without_moving_joints_the_derivative_is_the_trees(body, rig):
     for k in range(0, len(rows), 17):
         a = np.r_[rows.direction[k], np.cross(arm[k], rows.direction[k])]
         np.testing.assert_allclose(J[k], a @ plain.tree.segment_jacobian(screws, int(rows.segment[k])), atol=1e-12)
+
+
+def test_half_axes_of_different_segments_are_derived_together(rig):
+    """Bulges of one segment do not depend on another segment's cylinders: a fit needs few worlds for all of them."""
+    body = load_body("humanoid_shoulders")
+    state, shape = at(body, clav_elev_r=15, clav_prot_l=10, arm_flex_r=40), CylinderShape(body)
+    scene = Scene(body, state, rig)
+    masks = silhouettes(Morphing(body), state, rig, 0.0)
+    seen = [SilhouetteSensor(rig[m.sensor], 1.0, TrackSettings()).prepare(m, scene) for m in masks]
+    frames = MatchedFrames(Worlds(World(body, rig), [shape]), [seen], None, None, shape.mean, [state], 0.05)
+    worlds = []
+
+    class Counted:
+        touches = frames.touches
+        body = frames.body
+
+        def parts(self, theta, frame, state):
+            worlds.append(theta)
+            return frames.parts(theta, frame, state)
+
+    class Apart(Counted):
+        touches = (None,) * len(shape.names)
+
+    together = differences(Counted(), shape.mean, shape.step, [state])[0]
+    few = len(worlds)
+    apart = differences(Apart(), shape.mean, shape.step, [state])[0]
+    np.testing.assert_allclose(together, apart, atol=1e-9)
+    assert few < 0.3 * (len(worlds) - few) and np.abs(together).max() > 1.0
+    (rows,) = frames.parts(shape.mean, 0, state)[0][1:]
+    assert isinstance(rows, DofRows) and rows.jacobian.shape == (len(rows), body.tree.n_dofs)

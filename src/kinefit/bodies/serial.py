@@ -27,7 +27,8 @@ radians:
     morphs/K/twist (6,)                                of a joint's motion
     morphs/K/target (V, 3)                             of a global morph [m]
     morphs/K/centre, radii (n,)  shift (3,)  on (N,)   of a local morph [m]
-    morphs/K/moves ()                                  whether it moves with its segment; may be missing
+    morphs/K/moves ()                                  whether it moves with its segment; may be missing, as the next
+    morphs/K/tilt, turn (3,) [rad]  stretch (3,)       of the radii of a local morph
     morphs/K/surfaces/...                              of a segment's second shape, as those of a body
     skin/nodes (V, K, 3)  faces (T, 3)  owners, weights (V, K)                K owners of each node
     closures, dimensions                               each as JSON, fields as of `closures`; may be missing
@@ -79,9 +80,12 @@ _SHAPES = {
     "joint": {"twist": "6!"},
     "global": {"target": "v 3!"},
     "surface": {},
-    "local": {"centre": "n!", "radii": "n", "shift": "3!", "on": "s$", "moves": ""},
+    "local": {"centre": "n!", "radii": "n", "shift": "3!", "on": "s$", "moves": "", "tilt": "3!",
+              "turn": "3!", "stretch": "3"},
 }  # fmt: skip
 """Arrays of each record, and of each kind of morph, with shapes as `fields_of` reads them."""
+
+_OLDER_MORPH = {"moves": np.array(False), "tilt": np.zeros(3), "turn": np.zeros(3), "stretch": np.ones(3)}
 
 _MORPHS: dict[str, type[Operator]] = {
     "joint": JointMotion, "global": GlobalMorph, "surface": SegmentMorph, "local": LocalMorph
@@ -302,7 +306,7 @@ def _morphs_from_arrays(arrays: Arrays, sizes: dict[str, int]) -> Iterator[Opera
     k = 0
     while own := below(arrays, f"morphs/{k}/"):
         try:
-            yield _morph_from_arrays({"moves": np.array(False), **own}, sizes)
+            yield _morph_from_arrays(_OLDER_MORPH | own, sizes)
         except (BodyError, KeyError, ValueError, TypeError) as error:
             raise BodyError(f"arrays of morph {k} are wrong ({error})") from error
         k += 1

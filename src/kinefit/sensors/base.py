@@ -85,7 +85,7 @@ def check_rows(rows: Any, sensor: str, body: Body) -> list[AnyRows]:
             wrong = int(used.min() if used.min() < 0 else used.max())
             problem = f"sensor '{sensor}' has rows on {what} {wrong}; body '{body.name}' has {most}"
             raise ObservationError(problem, remedy="Use body.tree.segment(name), or the segments of a point set.")
-        if isinstance(p, DofRows) and p.jacobian.shape[1] != n:
+        if isinstance(p, DofRows) and not callable(p.by_dof) and p.jacobian.shape[1] != n:
             problem = f"sensor '{sensor}' has a jacobian of {p.jacobian.shape[1]} columns; body '{body.name}' has {n}"
             raise ObservationError(problem, remedy="Give one column for each degree of freedom.")
     return list(parts)

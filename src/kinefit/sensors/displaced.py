@@ -112,5 +112,5 @@ def _moved(rows: AnyRows, T: NDArray) -> AnyRows:
     if isinstance(rows, DofRows):  # columns of the root are its twist about its own origin
         J = np.array(rows.jacobian)
         J[:, :3], J[:, 3:6] = rows.jacobian[:, :3] @ R.T, rows.jacobian[:, 3:6] @ R.T
-        return replace(rows, jacobian=J)
+        return replace(rows, by_dof=J)
     return rows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from kinefit.errors import ExportError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.motion import UP_AXES, Motion
+from kinefit.readers.video import Video
 from kinefit.simulation.figures import draw_figure, look_at, places, write_video
 
 _SLOPE_COLOUR = (240, 232, 226)  # BGR
@@ -79,7 +81,7 @@ def _turned(std: NDArray, R: NDArray) -> NDArray:
 
 def film(
     motion: Motion, path: str | os.PathLike[str], *, slope: float = 30.0, heading: float = 0.0, azimuth: float = 100.0,
-    size: tuple[int, int] = (960, 720),
+    size: tuple[int, int] = (960, 720), beside: str | os.PathLike[str] | None = None,
 ) -> None:  # fmt: skip
     """Write a video (.mp4) of a motion from `replayed` on its slope, with a panning camera.
 
@@ -87,10 +89,13 @@ def film(
     ----------
     slope, heading : [deg], see `replayed`
     azimuth : [deg] of the camera about the vertical axis, from the fall line
-    size : (width, height) [px], even
+    size : (width, height) [px] of the scene, even
+    beside : video to the left of the scene, whose first image is the motion's first frame, such as an overlay
 
     Raises
     ------
+    ObservationError
+        The video beside cannot be read, or is shorter than the motion.
     ExportError
         The suffix is not .mp4; the file cannot be written.
     """
@@ -99,12 +104,29 @@ def film(
         raise ExportError("videos are written only as .mp4", file=path, remedy=f"Write to {target.stem}.mp4.")
     lines, (up, _, R) = _lines(motion, slope, heading), _inclined(motion, slope, heading)
     cameras = enumerate(_cameras(motion, heading, azimuth, size))
-    images = (draw_figure(motion, frame, camera, _backdrop(camera, lines, R @ up)) for frame, camera in cameras)
+    images: Iterator[NDArray] = (draw_figure(motion, frame, camera, _backdrop(camera, lines, R @ up)) for frame, camera in cameras)
+    if beside is not None:
+        images, size = _joined(motion, Video(beside, rate=motion.rate), images, size)
     try:
         write_video(target, images, motion.rate, size)
     except OSError as error:
         problem = f"the video cannot be written ({error.strerror or error})"
         raise ExportError(problem, file=path, remedy="Give a writable folder with free space.") from error
+
+
+def _joined(
+    motion: Motion, video: Video, scenes: Iterable[NDArray], size: tuple[int, int]
+) -> tuple[Iterator[NDArray], tuple[int, int]]:
+    """Images (H, W, 3) BGR of a video and of the scene side by side, and their size (width, height) [px]."""
+    shown = [video.frame_at(t) for t in motion.times - motion.times[0]]
+    numbers = [k for k in shown if k is not None]
+    if len(numbers) < len(shown):
+        lasting = motion.times[-1] - motion.times[0]
+        problem = f"the video ends at {video.times[-1]:.2f} s, the motion lasts {lasting:.2f} s"
+        raise ObservationError(problem, file=video.path, remedy="Give a video of the same time, such as an overlay.")
+    width = 2 * round(0.5 * size[1] * video.size[0] / video.size[1])
+    scaled = (cv2.resize(video.read(k)[..., ::-1], (width, size[1]), interpolation=cv2.INTER_AREA) for k in numbers)
+    return map(np.hstack, zip(scaled, scenes)), (width + size[0], size[1])
 
 
 def _cameras(motion: Motion, heading: float, azimuth: float, size: tuple[int, int]) -> list[Camera]:

@@ -23,7 +23,7 @@ from kinefit.solvers.equations import inverse
 from kinefit.subject.gear import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import Parameters, World, stacked
-from kinefit.subject.subject import SubjectFit
+from kinefit.subject.subject import Progress, SubjectFit
 
 REACH = (0.08, 0.05, 0.03)
 """[m] correspondence distance of each round, coarse to fine; the last for all further rounds."""
@@ -52,6 +52,7 @@ def fit_subject(
     loss: Loss = SQUARED,
     posture: float = POSTURE_SHARE,
     coarse: tuple[int, int] = COARSE_ITERATIONS,
+    progress: Progress | None = None,
 ) -> SubjectFit:
     """Fit parameters and poses jointly to the measurements of K frames.
 
@@ -73,6 +74,7 @@ def fit_subject(
     posture : share of the body's posture prior that constrains the poses
     coarse : iterations of a round whose correspondences still change, and steps of the poses alone in each. Few
         iterations keep poses from following wrong lengths along the nearest points of a surface.
+    progress : called with ("body fit", rounds done, rounds at most)
 
     Raises
     ------
@@ -98,6 +100,8 @@ def fit_subject(
     shares = {} if looks is None else dict.fromkeys(sensors, min(looks / len(steps), 1.0))
     excess_of = {sensor: 1.0 / share for sensor, share in shares.items()}
     for used in range(1, rounds + 1):
+        if progress:
+            progress("body fit", used - 1, rounds)
         frames = MatchedFrames(worlds, steps, times, velocities, theta, states, reach[min(used, len(reach)) - 1])
         early, before = rematched or used < min(len(reach), rounds), theta
         solved = solve(
@@ -114,6 +118,8 @@ def fit_subject(
         if min(shares.values()) < 1.0:
             weighing, fine = Weighing(shares, loss, posture), (_FINE_ITERATIONS, MAX_POSE_STEPS)
             solved = solve(frames, theta, states, prior, step, weighing=weighing, iterations=fine)
+    if progress:
+        progress("body fit", rounds, rounds)
     world = worlds.at(solved.theta)
     return SubjectFit(
         world.body, world.rig, world.values, names, solved.theta, inverse(prior.information + solved.information),

@@ -99,7 +99,7 @@ def track_take(
         try:
             motion = track(
                 recording, body, trial=trial_of(take), height=take.height, smooth=smooth, contacts=contacts,
-                size=take.start is None and take.size is not False, lag=lag, noise=noise, settings=settings,
+                size=take.size or (take.start is None and take.size is None), lag=lag, noise=noise, settings=settings,
                 progress=progress, checkpoint=checkpoint,
             )  # fmt: skip
         except TrackingInterrupted as stopped:

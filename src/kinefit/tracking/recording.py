@@ -64,6 +64,7 @@ class Recording:
     on_body : depth cameras whose images show nothing but the body
     backgrounds : {depth camera: (H, W) [m]} of the empty scene
     start : step and state to begin with
+    poses : {step: state} of a former motion of all steps, over which its body is refined
     others : motions of other people in view, in the same world and time, by which depth images, masks and colours are
         parted
     up : vertical axis of the world
@@ -84,6 +85,7 @@ class Recording:
     on_body: tuple[str, ...] = ()
     backgrounds: Mapping[str, NDArray] = field(default_factory=dict)
     start: tuple[int, BodyState] | None = None
+    poses: Mapping[int, BodyState] = field(default_factory=dict)
     others: tuple[Motion, ...] = ()
     up: str = "z"
     level: bool = True

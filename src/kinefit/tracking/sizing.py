@@ -42,6 +42,7 @@ from kinefit.tracking.unknowns import Unknowns, of_all, of_points
 _MAX_STEPS = 100  # steps that are tracked to find the person's shape ...
 _MAX_STEPS_ONE_CAMERA = 600  # of one camera's keypoints: poses that differ distinguish the lengths
 _POSES = 8  # and how many of them it is found from: twice as many change no half axis by more than its deviation
+_REFINING_POSES = 20  # of a former motion: they are near the truth, and cost no tracking
 _MARKER_POSES = 16  # of markers alone, whose places are found by how they move; a frame of them costs little
 _MATCHES = 3  # rounds of matching and solving
 _PLACES = 2  # fits with a better spread of the markers' places; it changes by less than a tenth from then on
@@ -275,14 +276,16 @@ def _by_all(
     r, body = person.recording, person.subject.body
     first = 0 if person.start is None else person.start[0]
     tried, many = (_MAX_STEPS_ONE_CAMERA, _MARKER_POSES) if r.alone is not None else (_MAX_STEPS, _POSES)
+    many = _REFINING_POSES if r.poses else many
+    near = person.poses or {i: r.poses[i] for i in spread(len(r.poses), many).tolist()}
     stretch = slice(first, min(first + tried, len(r)))
     start = None if person.start is None else (0, person.start[1])
     counted = None
     if progress:
         counted = lambda what, done, total: progress("shape", done, total)
     try:
-        if person.poses:
-            first, tracked = 0, _fitted_at(person.poses, r, body, settings)
+        if near:
+            first, tracked = 0, _fitted_at(near, r, body, settings)
         else:
             tracked = run(
                 r.part(stretch), body, settings, start=start, view_bias=person.subject.view_bias, progress=counted
@@ -309,7 +312,7 @@ def _by_all(
         rounds, coarse = ROUNDS if balls else (_MATCHES, joint.COARSE_ITERATIONS)
         return joint.fit_subject(
             world.body, world.rig, seen, near, unknown.parameters, start=unknown.start, loss=settings.loss,
-            times=times, velocities=velocities, rounds=rounds, coarse=coarse,
+            times=times, velocities=velocities, rounds=rounds, coarse=coarse, progress=progress,
         )  # fmt: skip
 
     points = None

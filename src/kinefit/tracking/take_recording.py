@@ -114,7 +114,8 @@ def recording_of(
     stereo = load_stereo(take, seen)
     depth: tuple[DepthVideo, ...] = (*seen.depth, *stereo)
     rig = Rig((*(seen.rig or ()), *(v.camera for v in stereo if v.camera is not None)))
-    start = _motion_start(take, body) if take.start is not None else posed_start(take, body, seen.frames)
+    known = _motion_poses(take, body, seen)
+    start = (0, known[0]) if known else posed_start(take, body, seen.frames)
     marked, body = _markers(take, seen, body)
     first, rate = seen.frames[0], seen.rate
     times = np.arange(*seen.frames) / rate + seen.first_time
@@ -142,7 +143,7 @@ def recording_of(
         times, rate, rig, steps=steps, sigma=_sigma(take, seen, stereo), markers=tuple(marked),
         depth=_first_depth(depth, seen), on_body=tuple(v.sensor for v in depth if v.on_body),
         backgrounds=_backgrounds(depth), start=start, up=take.up, level=is_level(take),
-        name=take.name,
+        name=take.name, poses=known if take.size else {},
         sensors=sensors_of(take, seen, body),
     )  # fmt: skip
     if seen.keypoints:
@@ -266,18 +267,26 @@ def posed_start(take: Take, body: Body, frames: tuple[int, int]) -> tuple[int, B
     return step - frames[0], BodyState(T, angles)
 
 
-def _motion_start(take: Take, body: Body) -> tuple[int, BodyState]:
-    assert take.start is not None
+def _motion_poses(take: Take, body: Body, seen: Observations) -> dict[int, BodyState]:
+    """Poses of the motion of `start`, by step; the first alone where its body is not refined over them."""
+    if take.start is None:
+        return {}
     motion = read_motion(take.start)
     if len(motion.body.tree.coordinates) != len(body.tree.coordinates):
         raise BodyError(
             f"the motion of start has the body {motion.body.name}, not {body.name}", file=take.path,
             place="[take] start", remedy="Start from a motion of the take's body.",
         )  # fmt: skip
-    root = motion.Ts_world_root[0]
+    steps = seen.frames[1] - seen.frames[0]
+    if take.size and (len(motion) != steps or not np.isclose(motion.rate, seen.rate, rtol=1e-3)):
+        problem = f"the motion of start has {len(motion)} frames at {motion.rate:g} Hz, "
+        problem += f"this take {steps} at {seen.rate:g} Hz"
+        remedy = "Start from a motion of this very take, or leave out size = true."
+        raise TakeError(problem, file=take.path, place="[take] start", remedy=remedy)
+    roots = motion.Ts_world_root
     if not is_level(take) and FLOOR in motion.provenance:
-        root = se3.inverse(np.array(motion.provenance[FLOOR]["T_level_world"])) @ root
-    return 0, BodyState(root, motion.angles[0])
+        roots = se3.inverse(np.array(motion.provenance[FLOOR]["T_level_world"])) @ roots
+    return {i: BodyState(T, q) for i, (T, q) in enumerate(zip(roots, motion.angles)) if take.size or not i}
 
 
 def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMarkers], Body]:

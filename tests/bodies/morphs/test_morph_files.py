@@ -45,6 +45,9 @@ segment = "thorax"
 centre = [0.1, 0.1, 0.08]
 radii = [0.1, inf, 0.1]
 shift = [0.01, 0.0, 0.005]
+tilt = [0, 0, 20]
+turn = [10, 30, 0]
+stretch = [1.5, 1.0, 0.5]
 on = ["thorax"]
 angle = "arm_flex_r"
 start = 0
@@ -71,7 +74,8 @@ def test_a_morph_is_what_its_file_says():
     np.testing.assert_allclose(joint, body.tree.rest[shoulder] + [0.03, -0.04, -0.01], atol=1e-12)
     assert (image.segment, image.steering.coordinate) == ("upperarm_l", "arm_add_l")
     assert muscle.surfaces[0].radii == ((0.06, 0.05), (0.042, 0.042))
-    assert bulge.on == ("thorax",) and bulge.steering.beyond
+    assert bulge.on == ("thorax",) and bulge.steering.beyond and bulge.stretch == (1.5, 1.0, 0.5)
+    np.testing.assert_allclose(np.degrees([bulge.tilt, bulge.turn]), [[0, 0, 20], [10, 30, 0]], atol=1e-12)
     assert (body.name, body.stature, len(body.tree.coordinates)) == ("own", 1.75, 41)
 
 
@@ -193,8 +197,12 @@ def test_a_part_goes_with_its_morphs():
 
 def test_the_docs_example_is_a_body():
     text = (Path(__file__).parents[3] / "docs" / "morphing.md").read_text("utf-8")
-    example = next(block for block in text.split("```toml\n")[1:]).partition("```")[0]
+    example, tendon = (block.partition("```")[0] for block in text.split("```toml\n")[1:3])
     assert [type(m) for m in parse_body(example).morphs] == [LocalMorph, JointMotion]
+    (found,) = parse_body(f'[body]\nname = "t"\nbase = "arm"\n{tendon}').morphs
+    assert found.deforms and found.moves
+    rest = np.abs(posed(replace(load_body("arm"), morphs=(found,)), elbow_flex_r=100).shift).max()
+    assert 0.005 < rest < 0.012  # of the 1 cm stated
 
 
 def change(old, new):
@@ -216,6 +224,9 @@ def change(old, new):
         (change("radii = [0.1, inf, 0.1]", "radii = [0.1, 0.0, 0.1]"), "radii .* of a bulge"),
         (change("radii = [0.1, inf, 0.1]", "radii = [0.1, nan, 0.1]"), "radii .* of a bulge"),
         (change("shift = [0.01, 0.0, 0.005]", "shift = [nan, 0.0, 0.005]"), "`shift` is not finite"),
+        (change("stretch = [1.5, 1.0, 0.5]", "stretch = [1.5, 0.0, 0.5]"), "local morph of thorax.*`stretch` above 0"),
+        (change("tilt = [0, 0, 20]", "tilt = [0, inf, 20]"), "a bulge with tilt"),
+        (change('kind = "surface"\n', 'kind = "surface"\ntilt = [0, 0, 1]\n'), "a surface morph has no tilt"),
         (change("end = -100", "end = -10"), "steered by arm_add_r from"),
         (change("weight = [[0.0, 1.0], [0.5, 0.2], [1.0, 0.0]]", 'weight = "cubic"'), "no weighting 'cubic'"),
         (change("[0.5, 0.2], [1.0, 0.0]]", "[0.5, 0.2]]"), r"ω\(0\) = 1.0 and ω\(1\) = 0.2"),

@@ -219,6 +219,37 @@ def test_a_bulge_that_moves_with_a_bone(scene, blended):
         LocalMorph(centre, radii, shift, bulge.steering, moves=True)
 
 
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("blended", [False, True])
+def test_a_bulge_whose_radii_turn_and_stretch_with_a_joint(scene, blended, moves):
+    """P1 3.3: radii along axes of their own, deformed by the joint's angle; derivatives by differences."""
+    body, mesh, state, operators = scene
+    tree, bone = body.tree, body.tree.segments[4]
+    mesh = random_skin(body) if blended else mesh
+    centre, radii, shift = np.array([0.05, 0.1, 0.0]), np.array([0.3, 0.6, 0.9]), np.array([0.03, 0.0, 0.05])
+    steer = Steering(tree.coordinates[1], -2.0, 2.0)
+    shape = {"tilt": [0.0, 0.4, 0.2], "turn": [0.9, -0.3, 0.5], "stretch": [2.0, 0.7, 1.3]}
+    bulge = LocalMorph(centre, radii, shift, steer, bone, moves=moves, **shape)
+    pose, plain = Morphing(body, mesh, [bulge]).pose(state), Morphing(body, mesh, []).pose(state)
+    weight = steer.at(state.angles[1])[0]
+    R, t = (plain.frames[4, :9].reshape(3, 3), plain.frames[4, 9:]) if moves else (np.eye(3), np.zeros(3))
+    away = ((plain.vertices if moves else plain.nodes) - t) @ R - tree.rest[4] - centre
+    axes = se3.exp_so3(weight * np.array(shape["turn"])) @ se3.exp_so3(np.array(shape["tilt"]))
+    r = np.exp(-np.sum((away @ axes / (radii * np.array(shape["stretch"]) ** weight)) ** 2, axis=1))
+    if not (blended and moves):
+        apart = np.linalg.norm(pose.nodes - plain.nodes, axis=1)
+        np.testing.assert_allclose(apart, abs(weight) * r * np.linalg.norm(shift), atol=1e-12)
+    for plainer in ({}, {"tilt": shape["tilt"]}):
+        other = Morphing(body, mesh, [LocalMorph(centre, radii, shift, steer, bone, moves=moves, **plainer)])
+        assert np.abs(other.pose(state).vertices - pose.vertices).max() > 1e-3
+    model, h = Morphing(body, mesh, [*operators[:3], bulge]), 1e-6
+    expected = [
+        (model.pose(state.retract(step)).vertices - model.pose(state.retract(-step)).vertices) / (2 * h)
+        for step in h * np.eye(tree.n_dofs)
+    ]
+    np.testing.assert_allclose(model.pose(state).jacobian(np.arange(60)), np.moveaxis(expected, 0, -1), atol=1e-7)
+
+
 def shoulder():
     """The humanoid whose right shoulder sinks and comes forward as the arm does, twice morphed (P1, figure 9)."""
     body = load_body("humanoid")

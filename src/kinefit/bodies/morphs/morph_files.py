@@ -23,7 +23,7 @@ from kinefit.geometry import se3
 Vector = tuple[float, float, float]
 KINDS = {
     "joint": ({"segment"}, {"shift", "turn"}),  # required and optional keys
-    "local": ({"segment", "centre", "radii", "shift"}, {"on", "moves"}),
+    "local": ({"segment", "centre", "radii", "shift"}, {"on", "moves", "tilt", "turn", "stretch"}),
     "surface": ({"segment", "surface"}, set[str]()),
     "global": ({"target"}, {"unit"}),
 }
@@ -46,6 +46,8 @@ class MorphRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     radii: Vector | None = None
     on: list[str] | None = None
     moves: bool | None = None
+    tilt: Vector | None = None
+    stretch: Vector | None = None
     surface: SurfaceRecord | list[SurfaceRecord] | None = None
     target: str | None = None
     unit: str | None = None
@@ -89,7 +91,11 @@ def _morph(record: MorphRecord, tree: KinematicTree, source: str) -> Operator:
     if record.kind == "local":
         assert record.centre and record.radii and record.shift
         placed = np.array(record.centre), np.array(record.radii), np.array(record.shift)
-        return LocalMorph(*placed, steering, record.segment, tuple(record.on or ()), bool(record.moves))
+        tilt, turn = (np.radians(angles or (0.0, 0.0, 0.0)) for angles in (record.tilt, record.turn))
+        return LocalMorph(
+            *placed, steering, record.segment, tuple(record.on or ()), bool(record.moves), tilt, turn,
+            record.stretch or (1.0, 1.0, 1.0),
+        )  # fmt: skip
     if record.kind == "surface":
         assert record.segment
         surfaces = surfaces_of(record.surface, tree.segment(record.segment), source, "surface")
@@ -145,6 +151,7 @@ def _entry(morph: Operator, tree: KinematicTree) -> str:
     elif isinstance(morph, LocalMorph):
         own = {"kind": "local"} | {name: getattr(morph, name) for name in ("centre", "radii", "shift")}
         own |= {"segment": morph.segment or tree.segments[0], "on": morph.on or None, "moves": morph.moves}
+        own |= {"tilt": np.degrees(morph.tilt), "turn": np.degrees(morph.turn), "stretch": morph.stretch}
     elif isinstance(morph, SegmentMorph):
         if not all(isinstance(c, TaperedCylinder) for c in morph.surfaces):
             remedy = "Name its OBJ file in the body file."

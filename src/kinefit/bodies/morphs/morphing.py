@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 _AROUND, _ALONG = 20, 6  # nodes of cylinders, see `body_mesh`
-_MIN_BULGE = 1e-6  # of a radial basis function: smaller values are ignored
+_MIN_BULGE = 1e-8  # of a radial basis function: derivatives of smaller values are ignored
 _MAX_LOW_PASSES = 40  # for the coarsest approximation of a mesh
 
 
@@ -90,14 +90,22 @@ class Morphing:
         for o, s in motions:
             self._motions.setdefault(s, []).append(o)
         self._fields: list[tuple[Steering, NDArray]] = []
-        self._bulges: list[tuple[LocalMorph, NDArray, int]] = []  # moving ones: at rest, shares of nodes, segment
+        # Bulges of one function r, at rest, that act together; nodes, their shares, and the segment that carries them.
+        self._bulges: list[tuple[list[LocalMorph], NDArray, NDArray, int | None]] = []
+        together: dict[object, list[LocalMorph]] = {}
         for o in self.operators:
             if isinstance(o, GlobalMorph):
                 self._fields.append((o.steering, o.field(x, parameters)))
             elif isinstance(o, SegmentMorph):
                 self._fields.append((o.steering, self._segment_field(o)))
-            elif isinstance(o, LocalMorph) and o.moves:
-                self._bulges.append((o.placed(tree), self._node_shares(o)[:, 0], tree.segment(str(o.segment))))
+            elif isinstance(o, LocalMorph) and (o.moves or o.deforms):
+                carrier, share = tree.segment(str(o.segment)) if o.moves else None, self._node_shares(o)[:, 0]
+                one = (carrier, o.on, *(np.asarray(v, float).tobytes() for v in (o.centre, o.radii, o.tilt)))
+                bulges = together.setdefault(id(o) if o.deforms else one, [])
+                bulges.append(o.placed(tree))
+                if len(bulges) == 1:
+                    nodes = np.flatnonzero(share)
+                    self._bulges.append((bulges, nodes, share[nodes], carrier))
             elif isinstance(o, LocalMorph):
                 self._fields.append((o.steering, self._node_shares(o) * o.placed(tree).field(x, parameters)))
         above = np.eye(len(tree.segments), dtype=bool)
@@ -204,50 +212,79 @@ class Morphing:
         """Frames, screws and nodes of a state."""
         frames, screws, drives = self._with_joint_motions(state)
         shift: NDArray | None = None
-        slopes: dict[int, NDArray] = {}
         for steering, field in self._fields:
-            d, weight, slope = self._weight_of(steering, state)
-            if weight:
+            if weight := self._weight_of(steering, state)[1]:
                 shift = weight * field if shift is None else shift + weight * field
-            if slope:
-                slopes[6 + d] = slopes[6 + d] + slope * field if 6 + d in slopes else slope * field
-        out = MorphedPose(self, state, frames, screws, shift, slopes, tuple(drives))
-        for bulge, share, segment in self._bulges:
-            out = self._with_bulge(out, bulge, share, segment)
-        return out
+        for bulges, nodes, share, bone in self._bulges:
+            weights = [self._weight_of(bulge.steering, state)[1] for bulge in bulges]
+            if any(weights):
+                shift = np.zeros_like(self.skin.vertices) if shift is None else shift
+                _, y, along, back = self._carried(bulges, nodes, bone, frames)
+                shift[nodes] += (share * bulges[0].value(y, weights[0]))[:, None] * (weights @ along @ back)
+        return MorphedPose(self, state, frames, screws, shift, tuple(drives))
 
-    def _with_bulge(self, pose: MorphedPose, bulge: LocalMorph, share: NDArray, bone: int) -> MorphedPose:
-        """Add a bulge that moves with a bone: r(y) of nodes y in the bone's frame in this pose.
+    def _carried(
+        self, bulges: Sequence[LocalMorph], nodes: NDArray, bone: int | None, frames: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Bulges that move with a bone, r(y) of nodes y in the bone's frame in this pose, or that deform.
 
-        A node x at rest on segment n has y = T_bone⁻¹ T_n x, and is shifted by s r(y) R_nᵀ R_bone d. An angle that
-        moves n relative to the bone with (v, ω) changes y by R_boneᵀ (v + ω × T_n x), and rotates R_nᵀ R_bone d by −ω.
+        A node x at rest on segment n has y = T_bone⁻¹ T_n x, and is shifted by s r(y, s) R_nᵀ R_bone d. Without a bone
+        y = x, and the shift is s r(x, s) d.
+
+        Returns
+        -------
+        T_n x (k, 3) [m], y (k, 3) [m], R_bone d (b, 3) [m] of each bulge, and R_n, (k, 3, 3) or (3, 3).
         """
-        d, weight, slope = self._weight_of(bulge.steering, pose.state)
-        if not weight and not slope:
-            return pose
-        skin, f = self.skin, pose.frames
-        owner = skin.segment
-        R, t = f[:, :9].reshape(-1, 3, 3), f[:, 9:]
-        at = np.einsum("vij,vj->vi", R[owner], skin.vertices) + t[owner]
-        y = (at - t[bone]) @ R[bone]
-        r = share * radial_basis(y, bulge.centre, bulge.radii)
-        along = R[bone] @ np.asarray(bulge.shift, float)
-        rise = r[:, None] * (-2.0 * (y - bulge.centre) / np.square(bulge.radii)) @ R[bone].T  # of r, in the world
-        field = r[:, None] * (along @ R[owner])
-        slopes = dict(pose.slopes)
-        none = np.zeros_like(field)
-        slopes[6 + d] = slopes.get(6 + d, none) + slope * field
-        of_bone, centre = pose.segment_jacobian(bone), pose.state.T_world_root[:3, 3]
-        for n in np.unique(owner[r > _MIN_BULGE]):
-            apart, own = pose.segment_jacobian(int(n)) - of_bone, owner == n
-            for k in np.flatnonzero(np.abs(apart).max(axis=0) > 0.0):
-                v, w = apart[:3, k], apart[3:, k]
-                more = np.sum(rise[own] * (v + np.cross(w, at[own] - centre)), axis=1)[:, None] * along
-                change = np.zeros_like(field)
-                change[own] = weight * (more - r[own, None] * np.cross(w, along)) @ R[n]
-                slopes[int(k)] = slopes.get(int(k), none) + change
-        shift = weight * field if pose.shift is None else pose.shift + weight * field
-        return replace(pose, shift=shift, slopes=slopes)
+        x, shifts = self.skin.vertices[nodes], np.array([bulge.shift for bulge in bulges], float)
+        if bone is None:
+            return x, x, shifts, np.eye(3)
+        R, t = frames[:, :9].reshape(-1, 3, 3), frames[:, 9:]
+        back = R[self.skin.segment[nodes]]
+        at = np.einsum("vij,vj->vi", back, x) + t[self.skin.segment[nodes]]
+        return at, (at - t[bone]) @ R[bone], shifts @ R[bone].T, back
+
+    def _slopes(self, pose: MorphedPose) -> dict[int, NDArray]:
+        """Derivatives (V, 3) of the nodes at rest by degrees of freedom; see `MorphedPose`.
+
+        An angle that moves segment n relative to a bulge's bone with (v, ω) changes y of `_carried` by R_boneᵀ (v + ω ×
+        T_n x), and rotates R_nᵀ R_bone d by −ω.
+        """
+        out: dict[int, NDArray] = {}
+
+        def add(dof: int, nodes: NDArray | slice, change: NDArray) -> None:
+            if dof not in out:
+                out[dof] = np.zeros_like(self.skin.vertices)
+            out[dof][nodes] += change
+
+        for steering, field in self._fields:
+            d, _, slope = self._weight_of(steering, pose.state)
+            if slope:
+                add(6 + d, slice(None), slope * field)
+        R = pose.frames[:, :9].reshape(-1, 3, 3)
+        for bulges, nodes, share, bone in self._bulges:
+            steered = [self._weight_of(bulge.steering, pose.state) for bulge in bulges]
+            weights = [weight for _, weight, _ in steered]
+            at, y, each, back = self._carried(bulges, nodes, bone, pose.frames)
+            by_point, by_weight = bulges[0].slopes(y, weights[0])
+            r, owner = share * bulges[0].value(y, weights[0]), self.skin.segment[nodes]
+            for (d, weight, slope), of_one in zip(steered, each):
+                if slope:
+                    add(6 + d, nodes, slope * (r + weight * share * by_weight)[:, None] * (of_one @ back))
+            if bone is None or not any(weights):
+                continue
+            along = weights @ each
+            for n in np.unique(owner[r > _MIN_BULGE]):
+                own = np.flatnonzero((owner == n) & (r > _MIN_BULGE))
+                apart = pose.segment_jacobian(int(n)) - pose.segment_jacobian(bone)
+                moving = np.flatnonzero(np.abs(apart).max(axis=0) > 0.0)
+                v, w = apart[:3, moving], apart[3:, moving]
+                rise = share[own, None] * by_point[own] @ R[bone].T  # of r, in the world
+                more = rise @ v + np.cross(at[own] - pose.state.T_world_root[:3, 3], rise) @ w
+                turned = r[own, None, None] * np.cross(w.T, along)
+                change = (more[:, :, None] * along - turned) @ R[n]
+                for k, of_k in zip(moving, change.swapaxes(0, 1)):
+                    add(int(k), nodes[own], of_k)
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +297,6 @@ class MorphedPose:
     state : BodyState
     frames : (S, 12) and screws : (D, 6), like those of `KinematicTree.forward`.
     shift : (V, 3) [m] of the nodes at rest, by all morphs; None without an active morph.
-    slopes : degree of freedom -> (V, 3) derivative of the nodes at rest by it.
     drives : (degree of freedom, segment, (6,) twist about the root's origin): derivatives of joint motions by angles.
     """
 
@@ -269,8 +305,12 @@ class MorphedPose:
     frames: NDArray
     screws: NDArray
     shift: NDArray | None
-    slopes: dict[int, NDArray]
     drives: tuple[tuple[int, int, NDArray], ...]
+
+    @cached_property
+    def slopes(self) -> dict[int, NDArray]:
+        """Degree of freedom -> (V, 3) derivative of the nodes at rest by it."""
+        return self.morphing._slopes(self)
 
     def positions(self, points: PointSet) -> NDArray:
         """Points (K, 3) [m] in the world, with the motions of joints."""
@@ -331,10 +371,18 @@ class MorphedPose:
         )  # fmt: skip
         if self.slopes:
             R = self.frames[:, :9].reshape(-1, 3, 3)
-            back = np.einsum("nck,nckij,ni->ncj", skin.weights[chosen], R[skin.owners[chosen]], n)
+            moving = np.flatnonzero(self._are_moving[chosen].any(axis=1))
+            back = part[moving, :, None] * np.einsum(
+                "nck,nckij,ni->ncj", skin.weights[chosen[moving]], R[skin.owners[chosen[moving]]], n[moving]
+            )  # fmt: skip
             for d, slope in self.slopes.items():
-                out[:, d] += np.einsum("nc,ncj,ncj->n", part, back, slope[chosen])
+                out[moving, d] += np.einsum("ncj,ncj->n", back, slope[chosen[moving]])
         return out
+
+    @cached_property
+    def _are_moving(self) -> NDArray:
+        """(V,) bool: nodes that a morph moves with an angle."""
+        return np.any([slope.any(axis=1) for slope in self.slopes.values()], axis=0)
 
     def jacobian(self, index: ArrayLike) -> NDArray:
         """Derivatives (K, 3, 6 + D) of the nodes `index` (K,) in the world by δ, including those of the morphs."""

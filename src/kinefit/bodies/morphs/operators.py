@@ -141,11 +141,14 @@ class LocalMorph:
     on : names of the segments whose nodes it moves; default: all.
     moves : bool, whether centre and shift move with the segment, like a shoulder blade under the skin. Else the nodes
         near the centre at rest are shifted.
+    tilt : (3,) [rad] rotation vector from the segment's axes to those of the radii; in space.
+    turn : (3,) [rad] rotation vector of the radii's axes about the centre at weight 1, in the segment's axes.
+    stretch : (3,) factors of the radii at weight 1. At weight s: exp(s turn) exp(tilt), radii · stretchˢ.
 
     Raises
     ------
     BodyError
-        A moving bulge without a segment, radii that are not positive.
+        A moving bulge without a segment; radii or stretch that are not positive; a tilt or turn that is not finite.
     """
 
     centre: NDArray
@@ -155,12 +158,24 @@ class LocalMorph:
     segment: str | None = None
     on: tuple[str, ...] = ()
     moves: bool = False
+    tilt: ArrayLike = (0.0, 0.0, 0.0)
+    turn: ArrayLike = (0.0, 0.0, 0.0)
+    stretch: ArrayLike = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
         if self.moves and self.segment is None:
             raise BodyError("a bulge that moves needs a segment", remedy="Name the segment that carries it.")
         if not np.all(np.asarray(self.radii) > 0.0):
             raise BodyError(f"radii {list(self.radii)} of a bulge", remedy="Give positive ones; inf is no limit.")
+        deforming = np.asarray([self.tilt, self.turn, self.stretch], float)
+        if not np.isfinite(deforming).all() or not np.all(deforming[2] > 0.0):
+            problem = f"a bulge with tilt {self.tilt}, turn {self.turn} and stretch {self.stretch}"
+            raise BodyError(problem, remedy="Give finite numbers, three each, `stretch` above 0.")
+
+    @cached_property
+    def deforms(self) -> bool:
+        """Whether its shape changes with the angle."""
+        return bool(np.any(self.turn) or np.any(np.asarray(self.stretch) != 1.0))
 
     def placed(self, tree: KinematicTree) -> LocalMorph:
         """The morph with its centre in the root frame at rest."""
@@ -181,7 +196,32 @@ class LocalMorph:
         shift = np.asarray(self.shift, float)
         if shift.shape != (3,) or not np.isfinite(shift).all():
             raise BodyError(f"a bulge by {self.shift}", remedy="Give three numbers in metres.")
-        return radial_basis(at, self.centre, self.radii)[:, None] * shift
+        r = self.value(at, 0.0) if np.any(self.tilt) else radial_basis(at, self.centre, self.radii)
+        return r[:, None] * shift
+
+    def value(self, x: NDArray, weight: float) -> NDArray:
+        """Deformed radial basis function r (N,) at points x (N, 3) [m] and a weight.
+
+        r = exp(−Σ_i (u_i / ρ_i)²) with u = (exp(s turn) exp(tilt))ᵀ (x − c), ρ = radii · stretchˢ, s the weight.
+        """
+        axes, radii = self._deformed(weight)
+        return np.asarray(np.exp(-np.square((x - self.centre) @ (axes / radii)).sum(axis=1)))
+
+    def slopes(self, x: NDArray, weight: float) -> tuple[NDArray, NDArray]:
+        """Derivatives of `value` by the point (N, 3) [1/m] and by the weight (N,)."""
+        axes, radii = self._deformed(weight)
+        away, r = x - np.asarray(self.centre), self.value(x, weight)
+        u = away @ axes
+        pull = 2.0 * r[:, None] * u / radii**2
+        growing = u * np.log(self.stretch) + np.cross(np.asarray(self.turn), away) @ axes
+        return -pull @ axes.T, np.sum(pull * growing, axis=1)
+
+    def _deformed(self, weight: float) -> tuple[NDArray, NDArray]:
+        """Axes of the radii (3, 3), one a column, and the radii (3,) [m]."""
+        if not (self.deforms or np.any(self.tilt)):
+            return np.eye(3), np.asarray(self.radii, float)
+        axes = se3.exp_so3(weight * np.asarray(self.turn)) @ se3.exp_so3(np.asarray(self.tilt))
+        return axes, np.asarray(self.radii) * np.asarray(self.stretch) ** weight
 
     def stretched(self, old: KinematicTree, new: KinematicTree, factors: NDArray) -> LocalMorph:
         """The bulge on a body whose segments were scaled by factors (S,): scaled with its segment, if it has one."""

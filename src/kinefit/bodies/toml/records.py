@@ -161,7 +161,7 @@ AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 """Directions by name."""
 
 _FLIPS = dict.fromkeys(("at", "centre", "shift", "start", "end", "side", "axis"), (1.0, 1.0, -1.0))
-_FLIPS["turn"] = (-1.0, -1.0, 1.0)
+_FLIPS["turn"] = _FLIPS["tilt"] = (-1.0, -1.0, 1.0)
 _NAMES = ("name", "parent", "segment", "angle", "point", "to", "on", "coordinates", "of")
 
 

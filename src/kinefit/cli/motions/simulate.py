@@ -338,6 +338,7 @@ def _movements(summaries: list[Summary]) -> list[str]:
 Examples:
   kinefit replay motion.npz -o ride.mp4 --speed 6               a video on a slope of 30 degrees
   kinefit replay motion.npz -o ride.npz --speed 6 --gain 1.5    a motion; show it with kinefit view ride.npz
+  kinefit replay my_take-kinefit -o both.mp4 --slope 0 --speed 0 --beside my_take-kinefit/overlays/cam01.mp4
 """)  # fmt: skip
 @click.argument("source", metavar="MOTION", type=_screen.PATH)
 @click.option("-o", "--out", required=True, type=_screen.PATH, help="Video (.mp4) or motion (.npz).")
@@ -346,9 +347,11 @@ Examples:
 @click.option("--speed", type=float, default=4.0, show_default=True, help="[m/s] Initial speed down the slope.")
 @click.option("--gain", type=float, default=0.0, show_default=True, help="[m/s²] Acceleration down the slope.")
 @click.option("--azimuth", type=float, default=100.0, show_default=True, help="[deg] Camera from the fall line.")
+@click.option("--beside", metavar="VIDEO", type=_screen.PATH, help="Video of the same frames to the left of the scene.")
 @_screen.verbose_option
 def replay(
-    source: Path, out: Path, slope: float, heading: float, speed: float, gain: float, azimuth: float
+    source: Path, out: Path, slope: float, heading: float, speed: float, gain: float, azimuth: float,
+    beside: Path | None,
 ) -> None:
     """Place a motion on a slope, move it downhill, and write it as a video or a motion."""
     from kinefit.exporters.motion_file import write_motion
@@ -356,12 +359,14 @@ def replay(
     from kinefit.simulation.replay import film, replayed
 
     _screen.check_file(out, "--out")
+    if beside is not None and out.suffix.lower() == ".npz":
+        raise click.UsageError("--beside is for videos: write to a file ending in .mp4, or leave it out.")
     found = source / "motion.npz" if source.is_dir() else source
     moved = replayed(read_motion(found), slope=slope, heading=heading, speed=speed, gain=gain)
     if out.suffix.lower() == ".npz":
         write_motion(moved, out)
     else:
-        film(moved, out, slope=slope, heading=heading, azimuth=azimuth)
+        film(moved, out, slope=slope, heading=heading, azimuth=azimuth, beside=beside)
     _screen.say(f"{out}: {len(moved)} frames")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -48,13 +50,16 @@ def morphed_rows(
         raise ObservationError("a standard deviation that is not positive", remedy="Give metres above 0.")
     part = np.ones(chosen.shape) if share is None else np.asarray(share, float)
     known = np.isfinite(r) & np.isfinite(n).all(1)
-    chosen, n, r, part, ids = chosen[known], n[known], r[known], part[known], np.flatnonzero(known)
-    weight = 1.0 / deviation[known] ** 2
+    ids, weight = np.flatnonzero(known), 1.0 / deviation[known] ** 2
+    if len(ids) < len(r):
+        chosen, n, r, part = chosen[ids], n[ids], r[ids], part[ids]
     skin = pose.morphing.skin
     if pose.morphing.is_rigid and (skin.owners[chosen, 0] == skin.owners[chosen[:, :1], 0]).all():
         x = np.einsum("kc,kci->ki", part, pose.vertices[chosen])
         return Rows.of(skin.owners[chosen[:, 0], 0], x, n, r, weight, ids)
-    return DofRows(pose.along(chosen, n, part), r, weight, ids)
+    owner = skin.owners[chosen].astype(np.int64)  # (K, C, owners of a node)
+    segment = owner[:, 0, 0] if (owner == owner[:, :1, :1]).all() else None
+    return DofRows(cache(lambda: pose.along(chosen, n, part)), r, weight, ids, segment=segment)
 
 
 def on_moved_joints(pose: MorphedPose, rows: Rows) -> DofRows:

@@ -80,9 +80,10 @@ def _head(take: Take) -> _Odd:
             what = "[[keypoints]] if a start is given" if has_start else "[[keypoints]] or [[depth]]"
             yield f"'person' has no use without {what}", "[take] person", "Remove it."
     for key in ("height", "subject", "size"):
-        if take.start is not None and getattr(take, key) is not None:
+        given = getattr(take, key)
+        if take.start is not None and given is not None and given is not True:  # size = true: refined over its poses
             yield f"'{key}' has no use with start, which gives the body", f"[take] {key}", "Remove one of the two."
-        if take.size is False and key != "size" and getattr(take, key) is not None:
+        if take.size is False and key != "size" and given is not None:
             yield f"'{key}' has no use with size = false", f"[take] {key}", "Remove one of the two."
     for k, entry in enumerate(take.markers):
         unused = len({one.camera for one in take.keypoints}) > 1 or k or entry.model

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
-from kinefit.rows import AnyRows, Rows
+from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.solvers import _kernels_border, _kernels_linear
 from kinefit.solvers.bundle.arrow import MIN_DIAGONAL_RATIO
 from kinefit.solvers.equations import columns, dense_pattern, lock, normal_equations, residuals, robust_factors
@@ -271,9 +271,9 @@ def _owner(together: Sequence[int], touches: Sequence[frozenset[int] | None], co
 
 def _segments(parts: Sequence[Part]) -> NDArray | None:
     """(N,) the segment of every row; None if a row may depend on several."""
-    if not all(isinstance(rows, Rows) for _, rows in parts):
-        return None
-    return np.concatenate([np.zeros(0, np.int64), *(rows.segment for _, rows in parts if isinstance(rows, Rows))])
+    segments = [rows.segment if isinstance(rows, Rows | DofRows) else None for _, rows in parts]
+    known = [segment for segment in segments if segment is not None]
+    return np.concatenate([np.zeros(0, np.int64), *known]) if len(known) == len(segments) else None
 
 
 def apart(touches: Sequence[frozenset[int] | None], some: Iterable[int]) -> list[list[int]]:
