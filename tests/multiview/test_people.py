@@ -106,6 +106,22 @@ def test_two_do_not_share_the_views_of_one(off):
     assert [len(track.nodes.get(1, ())) for track in search.tracks] == [2, 0]
 
 
+@pytest.mark.parametrize(("other_seen", "off", "kept"), [(False, 0.35, 0), (True, 0.35, 1), (False, 0.1, 1)])
+def test_a_single_view_off_the_prediction_is_not_shared_out(other_seen, off, kept):
+    beside = next(iter(RIG)).T_camera_world[0, :3]  # across the image of the first camera
+    a, b = np.zeros(3), -0.9 * beside
+    seen = [along(line(x, x, 2), k) for k, x in ((1, off * beside), (2, b))]
+    hidden = [(k, c, 0, 2) for k in (0, 1) for c in range(1, len(RIG))] + [(1, 0, 0, 2)] * (not other_seen)
+    search = people._Search(RIG, records(seen, unseen=hidden)[0])
+    columns = some_columns(len(NAMES))
+    search.tracks = [
+        people._OpenTrack(x[0][columns], np.zeros((len(columns), 3)), 0, 0, 0)
+        for x in (along([a], 1), along([b], 2))
+    ]
+    search._continue_tracks(1, search.tracks)
+    assert [len(track.nodes.get(1, ())) for track in search.tracks] == [kept, int(other_seen)]
+
+
 def test_five_people_in_a_crowd():
     places = [(0.0, 0.0, 0.0), (0.7, 0.0, 0.2), (-0.7, 0.0, 0.3), (0.2, 0.0, 0.8), (-0.3, 0.0, -0.7)]
     people = [along(line(p, np.add(p, (0.3, 0.0, 0.1)), 30), k) for k, p in enumerate(places)]

@@ -2,7 +2,8 @@
 
 Each person's points in space are predicted for the next frame. In every camera, people and detections are assigned at
 the least total cost, and views that disagree with a person's other views are rejected. If two tracks have views of one
-person, one of them gets none in that frame; neither does a track with a single view within a step of another person.
+person, one of them gets none in that frame; neither does a track with a single view within a step of another person, or
+with one off its prediction that may be of somebody within two steps without a view in that image.
 Unassigned detections that agree in enough cameras start a new person or continue one that was just lost nearby. A
 backward pass adds earlier detections of each person. Longer absences are bridged by re-identification, see `returns`.
 """
@@ -38,6 +39,7 @@ from kinefit.observations.recordings import mirror_name
 _MAX_DETECTION_DISTANCE = 0.25  # relative to the detection's height, plus the motion of ...
 _ASSUMED_STATURE = 1.7  # [m] ... a person of this stature between frames; at most half a height
 _MAX_VIEW_ERROR = 0.08  # reprojection error of a person's views, relative to the height; of two see `association`
+_MAX_LONE_VIEW_ERROR = 0.12  # of a single view from its prediction, where it may be of another person
 _MAX_PAIR_STEP = 0.05  # [m] of points from two views only, from their prediction
 _MIN_PERSON_DISTANCE = 0.2  # [m] nearer points are duplicate detections of one person
 _MIN_PRESENCE_S = 1.0  # of a person; half of a take shorter than two seconds
@@ -253,7 +255,7 @@ class _Search:
     def _continue_tracks(self, frame: int, tracks: Sequence[_OpenTrack]) -> None:
         """Assign detections to tracks, camera by camera, and reject inconsistent views."""
         available, views, sides = self.unassigned(frame), [list[Node]() for _ in tracks], set[Node]()
-        expected = [t.expected(frame) for t in tracks]
+        expected, view_costs = [t.expected(frame) for t in tracks], dict[Node, float]()
         for q in range(len(self.cameras)):
             detections = [p for r, p in available if r == q]
             if not detections or not tracks:
@@ -268,17 +270,26 @@ class _Search:
             cost[cost > near[:, None]] = np.inf
             for t, p in assign(cost, 0.6):
                 views[t].append((q, detections[p]))
+                view_costs[q, detections[p]] = float(cost[t, p])
                 if swapped[t, p] < direct[t, p]:
                     sides.add((q, detections[p]))
-        updates: list[tuple[int, float, int, list[Node], NDArray | None]] = []
+        others = [t for t in self.tracks if len(t.nodes.get(frame, ())) > 1]
+        accepted = [(t.nodes[frame], t.path[frame]) for t in others]
+        seen = [*zip(views, expected), *accepted]
+        updates: list[tuple[bool, int, float, int, list[Node], NDArray | None]] = []
         for k in (k for k in range(len(tracks)) if views[k]):
             gap = abs(frame - tracks[k].last_met)
             reach = _MAX_PAIR_STEP + MAX_SPEED * gap / self.rate
             kept, found = self._consistent_views(frame, views[k], expected[k], sides, reach)
-            updates.append((gap, np.inf if found is None else _distance(found, expected[k]), k, kept, found))
-        accepted: list[tuple[list[Node], NDArray]] = []
-        for _, _, k, kept, found in sorted(updates, key=lambda one: one[:3]):
-            lone = found is None and any(_distance(expected[k], place) < MAX_STEP for _, place in accepted)
+            cost_k = view_costs[kept[0]] if found is None else _distance(found, expected[k])
+            if found is None and cost_k > _MAX_LONE_VIEW_ERROR:
+                unseen = [x for own, x in seen if kept[0][0] not in {q for q, _ in own}]
+                if any(_distance(expected[k], x) < 2.0 * MAX_STEP for x in unseen):
+                    continue  # it may be of somebody near whom this camera does not see
+            updates.append((found is None, gap, cost_k, k, kept, found))
+        for _, _, _, k, kept, found in sorted(updates, key=lambda one: one[:4]):
+            new = accepted[len(others) :]
+            lone = found is None and any(_distance(expected[k], place) < MAX_STEP for _, place in new)
             if lone or any(self._is_same_person(frame, kept, found, *other, sides) for other in accepted):
                 continue  # duplicate detections of another person: two bodies cannot share a place
             tracks[k].extend(frame, kept, found, MAX_SPEED / self.rate)

@@ -88,6 +88,23 @@ def test_noise_and_counts_need_not_be_told(body, kind):
     assert right > 0.99 and wrong < 0.004
 
 
+@pytest.mark.parametrize("off", [0.05, 0.06])  # [m] along x, beyond the noise
+def test_a_displaced_marker_is_less_probable_where_labels_are_absent_and_points_unrelated(body, off):
+    """As many points either way: what the search found tells how many labels are not worn."""
+    rng = np.random.default_rng(8)
+    pose = random_pose(body, rng, distortion=0.02)
+    at = pose.points[pose.truth]
+    label, absent = body.segments[1][-1], [own[-1] for own in body.segments[2:8]]
+    assert label not in absent
+    at[label, 0] += off
+    stray = at.mean(axis=0) + rng.uniform(1.0, 1.5, (7, 3))
+    worn = np.setdiff1d(np.arange(len(body)), absent)
+    all_worn = identify(body, np.concatenate([at, stray[:1]])).confidence[label]
+    some_worn = identify(body, np.concatenate([at[worn], stray])).confidence[label]
+    odds = np.array([some_worn, all_worn]) / (1 - np.array([some_worn, all_worn]))
+    assert 0.5 < some_worn < all_worn and odds[0] < 0.2 * odds[1]
+
+
 def test_noise_is_found(body):
     rng = np.random.default_rng(4)
     levels = [identify(body, random_pose(body, rng, distortion=d).points).scale for d in (0.0, 0.02, 0.06)]

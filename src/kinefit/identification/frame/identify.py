@@ -147,10 +147,11 @@ def _add_outliers(found: Solution, guess: NDArray, confidence: NDArray) -> None:
     """Assign free points to missing markers that moved beyond the noise, as on sliding skin.
 
     A share OUTLIER_SHARE of the markers has OUTLIER_SIGMAS times the deviation; the alternative is a missing marker
-    and an unrelated point. Changes guess and confidence.
+    and an unrelated point, by the shares of both in this solution. Changes guess and confidence.
     """
     search = found.search
     points = search.frame.points
+    gain = gain_of(found.matched, len(guess), len(points), search.frame.volume) - search.frame.gain
     free = np.setdiff1d(np.arange(len(points)), guess[guess >= 0])
     for node, c in found.chosen if len(free) else ():
         t, matched = node.table, node.index[c] >= 0
@@ -162,7 +163,7 @@ def _add_outliers(found: Solution, guess: NDArray, confidence: NDArray) -> None:
             at = np.empty(3)
             variance = place_joint(len(x), x, y, sigma, t.x[i], at)
             variance_sum = OUTLIER_SIGMAS**2 * search.sigma[t.index][i] ** 2 + variance
-            odds = search.gain[t.index][i] + np.log(OUTLIER_SHARE) - 1.5 * np.log(2 * np.pi * variance_sum)
+            odds = search.gain[t.index][i] + gain + np.log(OUTLIER_SHARE) - 1.5 * np.log(2 * np.pi * variance_sum)
             odds = odds - 0.5 * ((points[free] - at) ** 2).sum(1) / variance_sum
             best = int(np.argmax(odds))
             share = float(np.exp(odds[best]) / (1 + np.exp(odds).sum()))
