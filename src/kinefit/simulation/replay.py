@@ -103,8 +103,10 @@ def film(
     if target.suffix.lower() != ".mp4":
         raise ExportError("videos are written only as .mp4", file=path, remedy=f"Write to {target.stem}.mp4.")
     lines, (up, _, R) = _lines(motion, slope, heading), _inclined(motion, slope, heading)
-    cameras = enumerate(_cameras(motion, heading, azimuth, size))
-    images: Iterator[NDArray] = (draw_figure(motion, frame, camera, _backdrop(camera, lines, R @ up)) for frame, camera in cameras)
+    images: Iterator[NDArray] = (
+        draw_figure(motion, frame, camera, _backdrop(camera, lines, R @ up))
+        for frame, camera in enumerate(_cameras(motion, heading, azimuth, size))
+    )
     if beside is not None:
         images, size = _joined(motion, Video(beside, rate=motion.rate), images, size)
     try:
