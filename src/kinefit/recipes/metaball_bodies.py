@@ -2,13 +2,13 @@
 
 Each observation belongs to the limb that is closest at the start (3.3), whose field should be 1/2 there (eq. 15).
 Observations are weighted by their standard deviations (eq. 12), and Σ vᵀ P v over all types is minimised (eqs. 10 and
-13). Steps of the skeleton with a fixed shape alternate with steps of the shape with a fixed skeleton (4.2).
+13). The minimum over the skeleton with a fixed shape and that over the shape with a fixed skeleton alternate (4.2).
 `method="joint"` is kinefit's own fit: joint optimisation of the distances to the surface over shape and skeleton.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -37,7 +37,7 @@ from kinefit.recipes._metaball_steps import (
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
-from kinefit.solvers.least_squares import levenberg_marquardt
+from kinefit.solvers.least_squares import Fit, levenberg_marquardt
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.metaballs import ROUNDS, MetaballShape, fit_field, grown, unmeshed
 
@@ -52,7 +52,7 @@ class MetaballBody:
     states : K poses
     radii_std : {segment: (p,)} standard deviations of the radii's logarithms; alternating: with fixed poses.
     rms : float [m] root mean square distance of the points from the surface.
-    iterations : int, of both steps.
+    iterations : int, of the alternation or of the joint fit.
     """
 
     body: Body
@@ -74,12 +74,12 @@ def metaball_bodies(
     Parameters
     ----------
     body : Body whose segments have metaballs.
-    points : K arrays (N, 3) [m] in the world.
+    points : K arrays (N, 3) [m] in the world, in the order of time: a pose may also start from its neighbour's.
     states : K initial poses, near enough that each point is nearest to its own limb.
     sigma : [m] standard deviation of every point, or K of them: for all points, (N,), or (N, 3, 3) covariances [m²],
         of which the component along the surface's normal at the start is used (eq. 12).
     method : "alternating" as published; "joint" minimises distances to the surface over poses and radii together.
-    iterations : of the alternation: one damped step of every pose and one of every limb's shape.
+    iterations : of the alternation: every pose to its minimum, then every limb's shape to its minimum.
     tolerance : change of poses [rad, m] and of radii (logarithm) at which it ends.
     weights : bool, whether the fields' weights are estimated too (eq. 14).
     locked : (6 + D,) bool, fixed degrees of freedom.
@@ -106,17 +106,20 @@ def metaball_bodies(
     closest = [nearest(body, s, x, max_distance=helps.max_distance) for s, x in zip(states, points)]
     of, sigmas = [n.segment for n in closest], sigma_of_fields(limbs, sigma, [n.normal for n in closest])
     check_influence(body, points, states, of)
-    now, poses, std, rounds = body, list(states), dict[str, NDArray](), 0
-    damping: list[float | None] = [None] * len(poses)
+    now, poses, std, rounds, swept = body, list(states), dict[str, NDArray](), 0, False
     shape = {limb.segment: np.zeros(limb.radii.size + len(limb.radii) * weights) for limb in limbs}
+
+    def skeleton(k: int, start: BodyState) -> Fit:
+        rows = partial(pose_rows, now, k, points[k], of[k], sigmas[k], others, helps)
+        return levenberg_marquardt(now, start, rows, loss=helps.loss, limits=helps.limits, locked=fixed)
+
     for _ in range(iterations):
-        rounds, moved = rounds + 1, 0.0
-        for k, x in enumerate(points):
-            fit = levenberg_marquardt(
-                now, poses[k], partial(pose_rows, now, k, x, of[k], sigmas[k], others, helps), loss=helps.loss,
-                limits=helps.limits, locked=fixed, damping=damping[k], max_iterations=1)  # fmt: skip
-            moved = max(moved, float(np.abs(poses[k].difference(fit.state)).max()))
-            poses[k], damping[k] = fit.state, fit.damping
+        fits = [skeleton(k, pose) for k, pose in enumerate(poses)]
+        if not swept:
+            own, fits = fits, _lowest_of_neighbours(fits, skeleton)
+            swept = all(a is b for a, b in zip(own, fits))
+        rounds, moved = rounds + 1, max(float(np.abs(p.difference(f.state)).max()) for p, f in zip(poses, fits))
+        poses = [fit.state for fit in fits]
         frames = [now.tree.forward(s.T_world_root, s.angles)[0] for s in poses]
         for limb in limbs:
             x, s = points_of_limb(body, limb.segment, frames, points, of, sigmas)
@@ -134,6 +137,15 @@ def metaball_bodies(
             of = [nearest(now, s, x, max_distance=helps.max_distance).segment for s, x in zip(poses, points)]
     found = shaped_body(body, lambda limb: grown(limb, shape[limb.segment], weights=weights))
     return MetaballBody(found, tuple(poses), std, rms_distance(found, poses, points), rounds)
+
+
+def _lowest_of_neighbours(fits: list[Fit], skeleton: Callable[[int, BodyState], Fit]) -> list[Fit]:
+    """Fit each frame from its neighbours' poses too, forwards and backwards in time, and keep the lowest cost."""
+    out = list(fits)
+    forwards = [(k - 1, k) for k in range(1, len(out))]
+    for a, b in [*forwards, *((b, a) for a, b in reversed(forwards))]:
+        out[b] = min(out[b], skeleton(b, out[a].state), key=lambda fit: fit.equations.cost)
+    return out
 
 
 def _joint(
