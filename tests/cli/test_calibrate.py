@@ -111,7 +111,8 @@ def test_a_drawn_bar_becomes_a_calibration(waved, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("pairs", "length", "late"), [(CORNERS, 0.162, 0), (tuple((k, k + 6) for k in range(6)), 0.108, 0), (CORNERS, 0.162, 3)]
+    ("pairs", "length", "late"),
+    [(CORNERS, 0.162, 0), (tuple((k, k + 6) for k in range(6)), 0.108, 0), (CORNERS, 0.162, 3)],
 )
 def test_corners_of_a_real_board_are_a_bar(pairs, length, late, data_dir, tmp_path):
     """Images up to 10 ms apart of a board at 0.1 m/s; the recording's own calibration is from all of its corners."""

@@ -77,7 +77,7 @@ def test_each_half_ends_at_its_minimum(all_around):
 
 @pytest.mark.parametrize("seed", [21, 22])
 def test_a_pose_that_starts_in_another_minimum_is_reached_from_its_neighbour(seed):
-    """Alone, five or six of these ten poses end with the forearm turned by 15 to 40 degrees, the hand's radii 40 % off."""
+    """Alone, five or six of these ten poses end with the forearm turned, and the hand's radii 40 to 80 % off."""
     body, points, truth, start = arm(seed, 10, 200)
     found = metaball_bodies(BODY, points, start, iterations=10)
     off = np.degrees(np.abs([a.angles - b.angles for a, b in zip(found.states, truth)]))

@@ -3,7 +3,8 @@
 Each observation belongs to the limb that is closest at the start (3.3), whose field should be 1/2 there (eq. 15).
 Observations are weighted by their standard deviations (eq. 12), and Σ vᵀ P v over all types is minimised (eqs. 10 and
 13). The minimum over the skeleton with a fixed shape and that over the shape with a fixed skeleton alternate (4.2).
-`method="joint"` is kinefit's own fit: joint optimisation of the distances to the surface over shape and skeleton.
+`method="joint"` is kinefit's own fit: joint optimisation of the distances to the surface over shape and skeleton. It
+starts from the poses of a few rounds of the alternation.
 """
 
 from __future__ import annotations
@@ -40,6 +41,8 @@ from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
 from kinefit.solvers.least_squares import Fit, levenberg_marquardt
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.metaballs import ROUNDS, MetaballShape, fit_field, grown, unmeshed
+
+_START_ROUNDS = 3  # of the alternation, before the joint fit: one arm of ten ends elsewhere without
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +105,19 @@ def metaball_bodies(
             remedy = "Give one sigma alone, or use subject.fit.fit_subject."
             raise ObservationError("the joint fit does not accept locked, others or helps", remedy=remedy)
         return _joint(body, points, states, sigma, weights)
+    shape, poses, std, rounds = _alternating(
+        body, limbs, points, states, sigma, iterations, tolerance, weights, locked, others, helps
+    )
+    found = shaped_body(body, lambda limb: grown(limb, shape[limb.segment], weights=weights))
+    return MetaballBody(found, tuple(poses), std, rms_distance(found, poses, points), rounds)
+
+
+def _alternating(
+    body: Body, limbs: Sequence[Metaballs], points: Sequence[NDArray], states: Sequence[BodyState],
+    sigma: float | Sequence[ArrayLike], iterations: int, tolerance: float, weights: bool = False,
+    locked: ArrayLike | None = None, others: OtherRows | None = None, helps: MetaballHelps = AS_PRINTED,
+) -> tuple[dict[int, NDArray], list[BodyState], dict[str, NDArray], int]:  # fmt: skip
+    """Shape by segment (logarithms), poses, standard deviations by segment, rounds; see `metaball_bodies`."""
     fixed = None if locked is None else np.asarray(locked, bool)
     closest = [nearest(body, s, x, max_distance=helps.max_distance) for s, x in zip(states, points)]
     of, sigmas = [n.segment for n in closest], sigma_of_fields(limbs, sigma, [n.normal for n in closest])
@@ -135,8 +151,7 @@ def metaball_bodies(
             break
         if helps.reassign:  # without new meshes: fields may temporarily be too weak for one
             of = [nearest(now, s, x, max_distance=helps.max_distance).segment for s, x in zip(poses, points)]
-    found = shaped_body(body, lambda limb: grown(limb, shape[limb.segment], weights=weights))
-    return MetaballBody(found, tuple(poses), std, rms_distance(found, poses, points), rounds)
+    return shape, poses, std, rounds
 
 
 def _lowest_of_neighbours(fits: list[Fit], skeleton: Callable[[int, BodyState], Fit]) -> list[Fit]:
@@ -151,7 +166,9 @@ def _lowest_of_neighbours(fits: list[Fit], skeleton: Callable[[int, BodyState], 
 def _joint(
     body: Body, points: Sequence[NDArray], states: Sequence[BodyState], sigma: float, weights: bool
 ) -> MetaballBody:
-    """Joint fit of poses and shape to distances from the surface, as for takes."""
+    """Joint fit of poses and shape to distances from the surface, as for takes, from poses of the alternation."""
+    limbs = [s for s in body.surfaces if isinstance(s, Metaballs)]
+    states = _alternating(body, limbs, points, states, sigma, _START_ROUNDS, 0.0)[1]
     sensor, shape = PointCloudSensor("points", sigma, TrackSettings()), MetaballShape(body, weights=weights)
     clouds = [PointCloud("points", 0.1 * k, x) for k, x in enumerate(points)]
     steps = [[sensor.prepare(cloud, Scene(body, s, Rig(())))] for cloud, s in zip(clouds, states)]
