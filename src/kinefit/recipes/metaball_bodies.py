@@ -9,8 +9,7 @@ starts from the poses of a few rounds of the alternation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import partial
 from typing import Literal
 
@@ -26,9 +25,11 @@ from kinefit.geometry.camera import Rig
 from kinefit.observations import PointCloud
 from kinefit.recipes._metaball_steps import (
     AS_PRINTED,
+    MetaballBody,
     MetaballHelps,
     OtherRows,
     check_influence,
+    lowest_of_neighbours,
     points_of_limb,
     pose_rows,
     rms_distance,
@@ -43,26 +44,6 @@ from kinefit.subject.fit import fit_subject
 from kinefit.subject.metaballs import ROUNDS, MetaballShape, fit_field, grown, unmeshed
 
 _START_ROUNDS = 3  # of the alternation, before the joint fit: one arm of ten ends elsewhere without
-
-
-@dataclass(frozen=True, eq=False)
-class MetaballBody:
-    """A body of metaballs fitted to points.
-
-    Parameters
-    ----------
-    body : Body with the estimated radii.
-    states : K poses
-    radii_std : {segment: (p,)} standard deviations of the radii's logarithms; alternating: with fixed poses.
-    rms : float [m] root mean square distance of the points from the surface.
-    iterations : int, of the alternation or of the joint fit.
-    """
-
-    body: Body
-    states: tuple[BodyState, ...]
-    radii_std: dict[str, NDArray]
-    rms: float
-    iterations: int
 
 
 @checked
@@ -104,7 +85,7 @@ def metaball_bodies(
         if not isinstance(sigma, int | float) or locked is not None or others is not None or helps != AS_PRINTED:
             remedy = "Give one sigma alone, or use subject.fit.fit_subject."
             raise ObservationError("the joint fit does not accept locked, others or helps", remedy=remedy)
-        return _joint(body, points, states, sigma, weights)
+        return _joint(body, limbs, points, states, sigma, weights)
     shape, poses, std, rounds = _alternating(
         body, limbs, points, states, sigma, iterations, tolerance, weights, locked, others, helps
     )
@@ -132,7 +113,7 @@ def _alternating(
     for _ in range(iterations):
         fits = [skeleton(k, pose) for k, pose in enumerate(poses)]
         if not swept:
-            own, fits = fits, _lowest_of_neighbours(fits, skeleton)
+            own, fits = fits, lowest_of_neighbours(fits, skeleton)
             swept = all(a is b for a, b in zip(own, fits))
         rounds, moved = rounds + 1, max(float(np.abs(p.difference(f.state)).max()) for p, f in zip(poses, fits))
         poses = [fit.state for fit in fits]
@@ -154,26 +135,16 @@ def _alternating(
     return shape, poses, std, rounds
 
 
-def _lowest_of_neighbours(fits: list[Fit], skeleton: Callable[[int, BodyState], Fit]) -> list[Fit]:
-    """Fit each frame from its neighbours' poses too, forwards and backwards in time, and keep the lowest cost."""
-    out = list(fits)
-    forwards = [(k - 1, k) for k in range(1, len(out))]
-    for a, b in [*forwards, *((b, a) for a, b in reversed(forwards))]:
-        out[b] = min(out[b], skeleton(b, out[a].state), key=lambda fit: fit.equations.cost)
-    return out
-
-
 def _joint(
-    body: Body, points: Sequence[NDArray], states: Sequence[BodyState], sigma: float, weights: bool
-) -> MetaballBody:
+    body: Body, limbs: Sequence[Metaballs], points: Sequence[NDArray], states: Sequence[BodyState], sigma: float,
+    weights: bool,
+) -> MetaballBody:  # fmt: skip
     """Joint fit of poses and shape to distances from the surface, as for takes, from poses of the alternation."""
-    limbs = [s for s in body.surfaces if isinstance(s, Metaballs)]
     states = _alternating(body, limbs, points, states, sigma, _START_ROUNDS, 0.0)[1]
     sensor, shape = PointCloudSensor("points", sigma, TrackSettings()), MetaballShape(body, weights=weights)
     clouds = [PointCloud("points", 0.1 * k, x) for k, x in enumerate(points)]
     steps = [[sensor.prepare(cloud, Scene(body, s, Rig(())))] for cloud, s in zip(clouds, states)]
-    rounds, coarse = ROUNDS
-    found = fit_subject(body, Rig(()), steps, states, [shape], rounds=rounds, coarse=coarse)
+    found = fit_subject(body, Rig(()), steps, states, [shape], rounds=ROUNDS[0], coarse=ROUNDS[1])
     std, owner = np.sqrt(np.diag(found.covariance)), np.array([min(segments) for segments in shape.touches])
     of_limb = {body.tree.segments[k]: std[owner == k] for k in np.unique(owner)}
     return MetaballBody(found.body, found.states, of_limb, rms_distance(found.body, found.states, points), found.rounds)
