@@ -1,6 +1,11 @@
-"""Simulate a calibration bar with two targets: places of its ends, and detections in cameras."""
+"""Simulate a calibration bar with two targets: places of its ends, and detections in cameras; a board as bars."""
 
 from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,7 +14,7 @@ from kinefit._arguments import checked
 from kinefit.calibration.bar.targets import BarViews
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.se3 import exp_so3, transform
+from kinefit.geometry.se3 import exp_so3, log_so3, transform
 
 
 @checked
@@ -110,3 +115,39 @@ def draw_bar(
         patch = image[vs[0] : vs[-1] + 1, us[0] : us[-1] + 1]
         np.maximum(patch, 18.0 + 220.0 * share, out=patch)
     return np.clip(np.rint(image + rng.normal(0.0, noise, image.shape)), 0, 255).astype(np.uint8)
+
+
+CORNERS = (0, 9), (1, 10), (2, 11)
+"""Pairs of corners 16.2 cm apart of the board in `mv4_landmarks_caliscope`: three bars at a time."""
+CORNERS_LENGTH = 0.162
+
+
+def write_corners(
+    recording: Path, table: Path, *, pairs: Sequence[tuple[int, int]] = CORNERS, late: int = 0, seed: int = 0
+) -> None:
+    """Write pairs of corners of a moved board, as four webcams saw them, as centroids of a bar in random order.
+
+    The fourth webcam's images get the number of those `late` times before.
+    """
+    rng, seen = np.random.default_rng(seed), dict[tuple[int, int, int], str]()
+    with (recording / "calibration/extrinsic/xy.csv").open() as file:
+        for row in csv.DictReader(file):
+            at = int(row["sync_index"]), int(row["port"]), int(row["point_id"])
+            seen[at] = f"{row['img_loc_x']},{row['img_loc_y']}"
+    lines = ["camera,frame,u,v"]
+    for time, port in sorted({at[:2] for at in seen}):
+        for k, ends in enumerate(pairs):
+            if all((time, port, end) in seen for end in ends):
+                bar = f"cam_{port},{len(pairs) * (time - late * (port == 3)) + k}"
+                lines += [f"{bar},{seen[time, port, ends[end]]}" for end in rng.permutation(2)]
+    table.write_text("\n".join(lines))
+
+
+def pose_differences(found: Rig, known: Rig) -> tuple[float, float]:
+    """Largest relative difference of a distance between two cameras, and of their rotation [deg]."""
+    lengths, angles = list[float](), list[float]()
+    for a, b in combinations(known.names, 2):
+        one, other = (rig[b].T_camera_world @ np.linalg.inv(rig[a].T_camera_world) for rig in (found, known))
+        lengths.append(abs(float(np.linalg.norm(one[:3, 3]) / np.linalg.norm(other[:3, 3])) - 1.0))
+        angles.append(float(np.degrees(np.linalg.norm(log_so3(one[:3, :3] @ other[:3, :3].T)))))
+    return max(lengths), max(angles)

@@ -5,7 +5,7 @@ import csv
 import cv2
 import numpy as np
 import pytest
-from benchmarks.bar_scene import bar_rig, draw_bar, see_bar, wave_bar
+from benchmarks.bar_scene import CORNERS, bar_rig, draw_bar, pose_differences, see_bar, wave_bar, write_corners
 from click.testing import CliRunner
 
 from kinefit.cli.calibrate import calibrate
@@ -108,6 +108,24 @@ def test_a_drawn_bar_becomes_a_calibration(waved, tmp_path):
     assert picture.shape[1] > 1200 and (picture.max(axis=2) > 200).sum() > 1000  # targets over the images
     again = call(*words)
     assert isinstance(again.exception, ExportError)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "length", "late"),
+    [(CORNERS, 0.162, 0), (tuple((k, k + 6) for k in range(6)), 0.108, 0), (CORNERS, 0.162, 3)],
+)
+def test_corners_of_a_real_board_are_a_bar(pairs, length, late, data_dir, tmp_path):
+    """Images up to 10 ms apart of a board at 0.1 m/s; the recording's own calibration is from all of its corners."""
+    recording, table, out = data_dir("mv4_landmarks_caliscope"), tmp_path / "corners.csv", tmp_path / "room.toml"
+    write_corners(recording, table, pairs=pairs, late=late)
+    lenses = recording / "config.toml"
+    told = call("bar", table, "--length", length, "--size", "1280x720", "--interiors", lenses, "-o", out)
+    if late:
+        assert isinstance(told.exception, CalibrationError) and "cam_3" in str(told.exception)
+        return
+    assert told.exit_code == 0, told.output
+    lengths, angles = pose_differences(read_calibration(out), read_calibration(lenses))
+    assert lengths < (0.02 if pairs is CORNERS else 0.006) and angles < (1.0 if pairs is CORNERS else 0.4)
 
 
 def test_a_table_of_centroids_becomes_a_calibration(waved, tmp_path):

@@ -16,6 +16,7 @@ from kinefit.correspondences.points import prior_rows
 from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows
+from kinefit.solvers.least_squares import Fit
 
 OtherRows = Callable[[int, Body, BodyState], Iterable[AnyRows]]
 """Rows of other types of observation, from a frame's index, the body and the pose."""
@@ -47,6 +48,26 @@ class MetaballHelps:
 
 AS_PRINTED = MetaballHelps()
 """The method as published, without extensions."""
+
+
+@dataclass(frozen=True, eq=False)
+class MetaballBody:
+    """A body of metaballs fitted to points.
+
+    Parameters
+    ----------
+    body : Body with the estimated radii.
+    states : K poses
+    radii_std : {segment: (p,)} standard deviations of the radii's logarithms; alternating: with fixed poses.
+    rms : float [m] root mean square distance of the points from the surface.
+    iterations : int, of the alternation or of the joint fit.
+    """
+
+    body: Body
+    states: tuple[BodyState, ...]
+    radii_std: dict[str, NDArray]
+    rms: float
+    iterations: int
 
 
 def pose_rows(
@@ -112,13 +133,16 @@ def rms_distance(body: Body, states: Sequence[BodyState], points: Sequence[NDArr
 def check_influence(
     body: Body, points: Sequence[NDArray], states: Sequence[BodyState], of: Sequence[NDArray]
 ) -> None:
-    """Check that not all points, K arrays (N, 3) [m], are too far away for a gradient of the field.
-
-    Raises
-    ------
-    ObservationError
-        All are too far away.
-    """
+    """Raise ObservationError if all points, K arrays (N, 3) [m], are too far away for a gradient of the field."""
     first = [field_rows(body, s, x, o) for s, x, o in zip(states, points, of)]
     if not any(np.abs(rows.direction).max(initial=0.0) > 1e-9 for rows in first):
         raise ObservationError("no point lies near the body", remedy="Start nearer; check the unit and the world.")
+
+
+def lowest_of_neighbours(fits: list[Fit], skeleton: Callable[[int, BodyState], Fit]) -> list[Fit]:
+    """Fit each frame from its neighbours' poses too, forwards and backwards in time, and keep the lowest cost."""
+    out = list(fits)
+    forwards = [(k - 1, k) for k in range(1, len(out))]
+    for a, b in [*forwards, *((b, a) for a, b in reversed(forwards))]:
+        out[b] = min(out[b], skeleton(b, out[a].state), key=lambda fit: fit.equations.cost)
+    return out

@@ -229,7 +229,7 @@ def refined_body(body: Body, count: int) -> Body:
 
 def fit_field(
     limb: Metaballs, x: ArrayLike, sigma: ArrayLike, values: ArrayLike, *, weights: bool = False,
-    girth: float = np.inf, loss: Loss = SQUARED, iterations: int = 1,
+    girth: float = np.inf, loss: Loss = SQUARED, iterations: int = _MAX_ITERATIONS,
 ) -> tuple[NDArray, NDArray]:  # fmt: skip
     """Fit radii, and optionally weights, that minimise Σ p (F − 1/2)² over points (P4, eqs. 10, 14 and 15).
 
@@ -244,7 +244,7 @@ def fit_field(
     weights : whether weights are fitted too (eq. 14); radii alone otherwise (eq. 15)
     girth : prior standard deviation of the radii's logarithms, unitless
     loss : Loss of residuals in standard deviations
-    iterations : number of steps tried
+    iterations : number of steps tried, at most
 
     Returns
     -------

@@ -151,8 +151,8 @@ def _adjusted(
     pairs = first_pairs(cameras, uv, known, length)
     best: tuple[float, list[int], Rig] | None = None
     for pair in pairs[:6]:
-        rig, sigma, share = _grown(Rig(pair.cameras), uv[:, [pair.first, pair.second]], length, known)
-        cost = sigma / max(share, 1e-3) ** 2
+        rig, sigma, shares = _grown(Rig(pair.cameras), uv[:, [pair.first, pair.second]], length, known)
+        cost = sigma / max(shares[0], 1e-3) ** 2
         if best is None or cost < best[0]:
             best = (cost, [pair.first, pair.second], rig)
     assert best is not None
@@ -165,14 +165,16 @@ def _adjusted(
             trials[c] = (*resect(cameras[c], known_places.x_world[both], uv[both, c], known), int(both.sum()))
         c = max(trials, key=lambda c: trials[c][1] * trials[c][2])
         camera, share, count = trials[c]
+        before, members, rig = rig.names, [*members, c], Rig((*rig, camera))
+        if share > 0.0:
+            rig, _, shares = _grown(rig, uv[:, members], length, known)
+            share = shares[-1]
         if share < 0.5:
             raise CalibrationError(
-                f"it shares {count} places with the cameras before it ({', '.join(rig.names)}), of which "
+                f"it shares {count} places with the cameras before it ({', '.join(before)}), of which "
                 f"{100 * share:.0f} % agree", place=f"camera {cameras[c].name}",
                 remedy=f"Check that it is in step. Wave the bar in {MIN_PLACES} places that two cameras see.",
             )  # fmt: skip
-        members, rig = [*members, c], Rig((*rig, camera))
-        rig, _, _ = _grown(rig, uv[:, members], length, known)
     rig = Rig(tuple(rig[camera.name] for camera in cameras))
     rig = rig.moved(rig.cameras[0].T_camera_world)
     sigma = 1.0
@@ -194,21 +196,22 @@ def _limit(rig: Rig, known: bool) -> float:
     return max(inlier_distance(camera, known) * (camera.matrix[0, 0] if known else max(camera.size)) for camera in rig)
 
 
-def _grown(rig: Rig, uv: NDArray, length: float, known: bool) -> tuple[Rig, float, float]:
-    """A rig adjusted twice to the places that it triangulates; noise [px] and share of places that fit."""
-    sigma, share = 1.0, 0.0
+def _grown(rig: Rig, uv: NDArray, length: float, known: bool) -> tuple[Rig, float, NDArray]:
+    """A rig adjusted twice to the places that it triangulates; noise [px], share (C,) of places that fit a camera."""
+    sigma, seen = 1.0, np.isfinite(uv).all(axis=(2, 3))
+    shared, fits = seen & (seen.sum(axis=1) >= 2)[:, None], np.zeros_like(seen)
     for n in range(2):
         placed = place(rig, uv, length, _limit(rig, known), (0.2, 0.05)[n] * length)
         used = np.isfinite(placed.x_world).all(axis=(1, 2))
         if used.sum() < MIN_PLACES:
-            return rig, np.inf, 0.0
+            return rig, np.inf, np.zeros(len(rig))
+        fits = np.isfinite(placed.uv).all(axis=(2, 3))
         found = adjust_bar(
             rig, placed.x_world[used], placed.uv[used], length, interiors=not known, sigma=sigma,
             scatter=5e-3 * length, rounds=2, iterations=15,
         )  # fmt: skip
         rig, sigma = found[0].rig, found[2].sigma
-        share = used.sum() / max(int((np.isfinite(uv).all(axis=(2, 3)).sum(axis=1) >= 2).sum()), 1)
-    return rig, sigma, float(share)
+    return rig, sigma, fits.sum(axis=0) / np.maximum(shared.sum(axis=0), 1)
 
 
 def _check_count(used: int, total: int) -> None:

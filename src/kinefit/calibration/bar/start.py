@@ -21,6 +21,7 @@ MIN_PLACES = 12  # that two cameras share: 48 coordinates for 7 unknowns of thei
 _HYPOTHESES = 1500  # one in eight samples of four places has the right orders
 _MAX_ERROR = 0.01  # of the image's width: the distortion of an unknown lens
 _MAX_ERROR_KNOWN_LENS_PX = 3.0
+_RESECTION_ERRORS = 3.0  # as many times the error of an inlier: ends known from two cameras are off in depth
 _TRIED_FOCALS = np.geomspace(0.4, 4.0, 25)  # focal length over the image's longer side: 100 to 14 degrees wide
 _MIN_AGREEING_SHARE = 0.6  # of the places that two cameras share
 _MIN_PARALLAX = np.radians(2.0)  # between rays: with less distances are undetermined
@@ -266,7 +267,7 @@ def resect(camera: Camera, x_world: NDArray, uv: NDArray, known: bool) -> tuple[
     """
     if len(uv) < MIN_PLACES:
         return camera, 0.0
-    p, limit = flat(camera, uv, known), inlier_distance(camera, known)
+    p, limit = flat(camera, uv, known), inlier_distance(camera, known) * (_RESECTION_ERRORS if known else 1.0)
     middle, size = x_world.mean(axis=(0, 1)), max(float(x_world.std()), 1e-9)
     x = np.concatenate([(x_world - middle) / size, np.ones((len(uv), 2, 1))], axis=2)
     _, swapped, inside = _consensus(x, p, _direct, _projected, limit, rounds=8, least=6)
