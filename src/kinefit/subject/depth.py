@@ -38,6 +38,7 @@ _COARSE_ITERATIONS = 1, 2  # see `fit_subject`
 _INDEPENDENT_SHARE = 0.3  # of a frame's errors: neighbours share folds of cloth and the model's form
 _POSTURE_PRIOR_SHARE = 0.1  # with less, poses bend to fit wrong lengths (3 of ten people, 0.5 % worse)
 _CONTOUR_SIGMA_RATIO = 2.5  # to a point's: with 0.6, 1, 1.6, 2.5 lengths err by 2.5, 2.0, 2.0, 1.8 %
+INSIDE = 0.5
 _MAX_CONTOUR_COSINE = 0.5  # of normal and line of sight; elsewhere moving the surface inwards does not help
 
 
@@ -144,7 +145,7 @@ class _Contour(Measurement):
         out, trust = outside(self._view, x)
         sight = x - self._view.viewpoint
         is_contour = np.abs(np.einsum("ni,ni->n", n, sight)) < _MAX_CONTOUR_COSINE * np.linalg.norm(sight, axis=1)
-        use = (out > 0.0) & (out < 2.0 * reach) & (trust > 0.0) & is_contour & ~scene.surface.fingers
+        use = (out > -INSIDE * reach) & (out < 2.0 * reach) & (trust > 0.0) & is_contour & ~scene.surface.fingers
         place, normal = (np.ascontiguousarray(a[:, use].T) for a in (samples.point, samples.normal))
         anchors = SurfaceAnchors(scene.body, samples.segment[use], place, normal)
         patches = float(scene.surface.areas.sum()) / (self._of.settings.patch**2 * len(samples))

@@ -214,7 +214,7 @@ class Recovery:
         std = np.minimum(result.dof_std, np.where(np.arange(len(free)) < 6, ROOT_PRIOR_STD, np.pi))
         held = result.state, marginal_information(inverse(np.diag(std**2)), free)
         now = best = search.score.of(result.state) - LEAP * _against(tracker, result)
-        for state, least in find_limbs(search, result.state, seek):
+        for state, least in find_limbs(search, result.state, seek, lost):
             found = tracker.fitted(time, frames, state, held).result
             value = search.score.of(found.state) - LEAP * _against(tracker, found)
             if not self._shown(tracker, found, lost):
@@ -234,13 +234,16 @@ class Recovery:
         return None if view is None else PostureSearch(self.body, view, self.up, np.random.default_rng(0))
 
     def _shown(self, tracker: Searching, found: FrameResult, seek: NDArray) -> bool:
-        """Whether the surfaces that were seen show what was found: else it would hide, and not be found."""
+        """Whether the surfaces show something of each limb that was found: else it would hide."""
         scene = tracker.scene_of(found.state, found.time)
         views = [m for m in found.matched if m.shows_surface]
         hidden = np.ones(len(seek), bool)
         for m in views:
             hidden &= m.evidence(scene).hidden
-        return not (hidden & seek).any()
+        parts = limbs(self.body)
+        sought = [list(limb) for limb in parts if seek[list(limb)].any()]
+        trunk = np.isin(np.arange(len(seek)), [s for limb in parts for s in limb], invert=True)
+        return not (hidden & seek & trunk).any() and not any(hidden[limb].all() for limb in sought)
 
     def _leap(self, time: float, old: FrameResult, new: FrameResult, seek: NDArray) -> float:
         """How much faster than a brisk wave a limb would have moved since it was last seen where it was, 1 at least."""
