@@ -110,8 +110,8 @@ def find_limbs(
 ) -> list[tuple[BodyState, float]]:
     """Search a view for better poses of some limbs: states with the gain in score that each must exceed.
 
-    First the limbs, then the whole body are moved locally. A limb found elsewhere must gain `LEAP`, a lost one
-    `MIN_LOST_GAIN`.
+    First the limbs, then the whole body are moved locally. A limb found elsewhere must gain `LEAP`,
+    a lost one `MIN_LOST_GAIN`.
 
     Parameters
     ----------
@@ -129,7 +129,8 @@ def find_limbs(
         sought = [limb for limb, one in zip(search.limbs, is_lost) if one == of_lost and seek[list(limb)].any()]
         for limb in sought:
             found = search.limb(found[0][0], limb, None, ends, tries)
-        out += [(s, v - current_score, least) for s, v in found[: 2 * bool(sought)]]
+        if sought:
+            out += [(s, v - current_score, least) for s, v in found[:2]]
     return [(s, min_gain) for s, gain, min_gain in sorted(out, key=lambda o: o[2] - o[1]) if gain > min_gain]
 
 

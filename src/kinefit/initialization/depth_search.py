@@ -27,8 +27,8 @@ YAWS = np.arange(0.0, 2 * np.pi, np.pi / 6)
 LEANS = ((0, 0), (20, 0), (45, 0), (-20, 0), (0, 20), (0, -20))  # [deg] forwards and sideways
 LIMB_TRIES = 200  # random poses of a limb in the refinement
 ROUGH_LIMB_TRIES = 100  # the same for each candidate of the trunk
-BEST_OF_EACH = 3  # candidates of each kind that are refined
-REACHES = 3  # random poses of a limb for each end of the surface that it is to reach
+LIMB_CANDIDATES = 3  # of each kind, random and reaching, that are refined
+REACHING_STARTS = 3  # random poses of a limb for each end of the surface that it is to reach
 _MIN_LIMB_PIXELS = 4  # of a visible limb
 _MIN_UNEXPLAINED = 0.01  # of a person's pixels for a limb's end: a hand has 2 %
 STEP_SIGMAS = (0.04, 0.2, 0.35)  # [m, rad, rad] initial random steps of the root's position and rotation, and of angles
@@ -204,8 +204,11 @@ class PostureSearch:
         held: dict[str, Any] = {"moving": limb, "base": self.score.depth(state, other_segments)}
         values = self.score(np.repeat(state.T_world_root[None], len(angles), axis=0), angles, drawn, **held)
         reaching = np.arange(len(angles)) > count
-        chosen = [k for of in (~reaching, reaching) for k in np.flatnonzero(of)[np.argsort(-values[of])[:BEST_OF_EACH]]]
-        best = [BodyState(state.T_world_root, angles[k]) for k in chosen]
+        best = [
+            BodyState(state.T_world_root, angles[k])
+            for kind in (np.flatnonzero(~reaching), np.flatnonzero(reaching))
+            for k in kind[np.argsort(-values[kind])[:LIMB_CANDIDATES]]
+        ]
         rough = sorted((self.polish(s, drawn, dofs, 3, 24, **held) for s in best), key=lambda b: -b[1])
         locked = np.ones(tree.n_dofs, bool)
         locked[dofs] = False
@@ -243,7 +246,7 @@ class PostureSearch:
 
     def _reaching(self, state: BodyState, limb: tuple[int, ...], ends: NDArray) -> NDArray:
         """(N, D) angles that bring a limb's tip and fist to ends (E, 3) [m] of the surface, from random poses."""
-        ends = np.tile(ends, (REACHES, 1))
+        ends = np.tile(ends, (REACHING_STARTS, 1))
         tree, d = self.body.tree, self._dofs_of(limb, False) - 6
         sight = (ends - self.view.viewpoint) / np.linalg.norm(ends - self.view.viewpoint, axis=1, keepdims=True)
         targets = np.tile(ends + 0.03 * sight, (2, 1))  # [m] the tip is half a wrist behind the measured surface
