@@ -137,6 +137,21 @@ def test_a_limb_that_is_where_it_is_does_not_leap(search):
         assert least == MIN_GAIN and off(state, 0).max() < 0.1
 
 
+@pytest.mark.parametrize("side", ["l", "r"])
+def test_an_arm_stretched_at_the_camera_is_found(side):
+    hanging, camera = BODY.usual_state(TRUTH.T_world_root), a_rig()["depth"]
+    truth = turned(hanging, **{f"arm_flex_{side}": 85, f"elbow_flex_{side}": 10})
+    depth, wrist = render_body(BODY, truth, camera).depth, BODY.landmarks.names.index(f"{side}_wrist")
+    person = np.isfinite(depth)
+    view = view_of(np.where(person, depth, 0.0), person, camera)
+    for seed in (0, 1):
+        search = PostureSearch(BODY, view, UP, np.random.default_rng(seed))
+        limb = next(limb for limb in search.limbs if BODY.tree.segment(f"forearm_{side}") in limb)
+        found, _ = search.limb(hanging, limb, None, search.ends(hanging), 200)[0]
+        one, other = (BODY.positions(state, BODY.landmarks)[wrist] for state in (found, truth))
+        assert np.linalg.norm(one - other) < 0.05
+
+
 def test_a_lost_limb_needs_less(search):
     wrong = turned(TRUTH, arm_add_l=-80, elbow_flex_l=60)
     for lost, least in ((segments("forearm_l"), MIN_LOST_GAIN), (segments("forearm_r"), LEAP)):
