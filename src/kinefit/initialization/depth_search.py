@@ -198,7 +198,7 @@ class PostureSearch:
         near_mean = self.rng.normal(tree.usual[d], np.minimum(prior_sigmas(self.body)[d], 0.6), size=(count, len(d)))
         angles = np.repeat(state.angles[None], 1 + count, axis=0)
         angles[1:, d] = np.clip(np.where(self.rng.random((count, 1)) < 0.35, near_mean, anywhere), low, high)
-        angles = np.concatenate([angles, self._reaching(state, limb, ends)])
+        angles = np.concatenate([angles, self._reaching(state, limb, np.tile(ends, (REACHING_STARTS, 1)))])
         drawn = tuple(range(len(tree.segments))) if drawn is None else drawn
         other_segments = tuple(s for s in drawn if s not in limb)
         held: dict[str, Any] = {"moving": limb, "base": self.score.depth(state, other_segments)}
@@ -245,8 +245,7 @@ class PostureSearch:
         return out
 
     def _reaching(self, state: BodyState, limb: tuple[int, ...], ends: NDArray) -> NDArray:
-        """(N, D) angles that bring a limb's tip and fist to ends (E, 3) [m] of the surface, from random poses."""
-        ends = np.tile(ends, (REACHING_STARTS, 1))
+        """(2 E, D) angles that bring a limb's tip and fist to ends (E, 3) [m] of the surface, from random poses."""
         tree, d = self.body.tree, self._dofs_of(limb, False) - 6
         sight = (ends - self.view.viewpoint) / np.linalg.norm(ends - self.view.viewpoint, axis=1, keepdims=True)
         targets = np.tile(ends + 0.03 * sight, (2, 1))  # [m] the tip is half a wrist behind the measured surface
