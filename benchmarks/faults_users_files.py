@@ -324,7 +324,9 @@ def _tagged(rate: str) -> Callable[[Path], None]:
     return make
 
 
-def _empty(*names: str) -> Callable[[Path], None]:
+def named_files(*names: str) -> Callable[[Path], None]:
+    """Files of some names, of which the content is not read."""
+
     def make(folder: Path) -> None:
         for name in names:
             (folder / name).write_bytes(b"x")
@@ -465,8 +467,8 @@ SIBLINGS: dict[str, Answer] = {
     "init: 120 Hz in 30": init(_tagged("120"), _has("rate = 120")),
     "init: time lapse": init(_tagged("2.0"), _has("rate = 2.0")),
     "init: a capture rate that is stored": init(_tagged("30.0"), _has("rate = 30")),
-    "init: an archive": init(_empty("session.zip"), _has("never"), "archive"),
-    "init: in the cloud": init(_empty(".IMG_0001.MOV.icloud"), _has("never"), "iCloud"),
-    "init: two fisheye images": init(_empty("VID.insv"), _has("never"), "360"),
+    "init: an archive": init(named_files("session.zip"), _has("never"), "archive"),
+    "init: in the cloud": init(named_files(".IMG_0001.MOV.icloud"), _has("never"), "iCloud"),
+    "init: two fisheye images": init(named_files("VID.insv"), _has("never"), "360"),
 }
 """{what it is: the state of the answer}; each gets an empty folder."""

@@ -30,7 +30,7 @@ from benchmarks.smoothing import acceleration_noise, peak_speeds
 from kinefit import Motion, track_take
 from kinefit.bodies import PointSet
 from kinefit.evaluation import angle_errors
-from kinefit.exporters.report.moments import DOUBT_DISTANCE_M, contradicted, doubtful, end_sigmas
+from kinefit.exporters.report.moments import DOUBT_DISTANCE_M, contradicted, end_variances, probably_far
 
 MIXES: dict[str, tuple[str, ...]] = {
     "cameras": ("keypoints",),
@@ -61,7 +61,8 @@ class Outcome:
     peak : float, speed of hands and feet that a fiftieth of the frames exceed, as a share of the truth
     seen, seen_turn : (S, 3), (D,) share of the frames in which joint centres and angles are observable
     seconds : float
-    doubt : (3, F, S) bool, segments of which an end is farther off than 8 cm; that are doubtful; that are lost
+    doubt : (4, F, S) segments of which an end is farther off than 5 cm; how likely that is by the motion; 1 where views
+        contradict; 1 where they are lost
     """
 
     shift: NDArray
@@ -100,8 +101,8 @@ def compare(truth: Motion, motion: Motion, seen: tuple[NDArray, NDArray], second
         acceleration_noise(shift, truth.rate), float(np.median(peak_speeds(motion) / peak_speeds(truth))), *seen,
         seconds,
         np.array([
-            error_of_ends(truth, motion) > DOUBT_DISTANCE_M, doubtful(end_sigmas(motion), contradicted(motion)),
-            motion.lost,
+            error_of_ends(truth, motion) > DOUBT_DISTANCE_M, probably_far(end_variances(motion)),
+            contradicted(motion), motion.lost,
         ]),
     )  # fmt: skip
 

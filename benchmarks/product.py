@@ -7,6 +7,7 @@ from benchmarks.figures import run_parts
 PARTS = {
     "start": "how long a user waits: first and later starts, the whole track of the demo's recording",
     "install": "what a fresh installation takes on disk, with the viewer and without",
+    "product_doors": "wrong and unusual inputs by a user's commands: right, said or unsaid",
     "window": "kinefit app in a browser: first image, answers while it computes, cost, typed words",
     "window_kills": "kinefit app killed while it computes a session of 20 takes",
     "report_pages": "pages of the demo's report in print",

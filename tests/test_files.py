@@ -15,8 +15,8 @@ from tests.exporters.synthetic import a_camera, smooth_motion
 from tests.strangers import ENDINGS, outcome, without_end
 
 from kinefit import exporters
-from kinefit._files import npy_header, parse_toml, read_npy, read_npz, regular, write_text, writing
-from kinefit.errors import BodyError, ExportError, FileError
+from kinefit._files import npy_header, parse_toml, read_npy, read_npz, regular, stature_of, write_text, writing
+from kinefit.errors import BodyError, ExportError, FileError, ObservationError
 from kinefit.readers.video import Video
 
 
@@ -26,6 +26,7 @@ from kinefit.readers.video import Video
         ('[a]\nfile = "C:\\Users\\me\\x.toml"', r'line 2.*forward slashes. Write "C:.Users.me.x.toml"'),
         ('file = "C:\\data\\x.toml"', "forward slashes"),
         ("size = True", "Write true"),
+        ("name = “walk”", "straight quotes"),
         ('name = walk', 'quotes: name = "walk"'),
         ('[camera]\nname = "a"\n[[camera]]\nname = "b"', r"the first one too: \[\[camera\]\]"),
         ("rate = 30\nrate = 60", "appears twice"),
@@ -260,3 +261,14 @@ def test_what_a_killed_process_left_goes_with_the_next(tmp_path):
         (tmp_path / name).write_bytes(b"half")
     write_text(tmp_path / "a[1].npz", "whole")
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted([*kept, "a[1].npz"])
+
+
+@pytest.mark.parametrize("text", ["1.75", "1,75", "175", "175 cm", "175cm", "1.75 m", "1,75m", "1750 mm", 1.75, 175])
+def test_a_stature_is_read_as_people_write_it(text):
+    assert stature_of(text) == 1.75
+
+
+@pytest.mark.parametrize("text", ["", "tall", "17.5", "1750", "0.2", "1.75 kg", "-1.75", "1.7.5", "nan", "175 m"])
+def test_what_is_no_stature_says_what_to_give(text):
+    with pytest.raises(ObservationError, match="no stature.*1.75 or 175"):
+        stature_of(text)

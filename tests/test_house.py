@@ -50,7 +50,7 @@ OUTPUTS = {"exporters", "viewers"}  # see everything up to rows
 SEEN_ONLY_BY = {
     "exporters": {"recipes", "batch", "live", "app", "cli", "preparing"},
     "viewers": {"recipes", "batch", "app", "cli"},
-    "assets": {"cli", "preparing", "exporters", "takes"},
+    "assets": {"cli", "app", "preparing", "exporters", "takes"},
 }
 RATCHET = tomllib.loads((ROOT / "tests" / "house_size.toml").read_text("utf-8"))
 SLACK = 0.005  # share by which a stored number may lie above the sources before it has to follow them down

@@ -204,6 +204,8 @@ def _remedy(text: str, problem: str) -> str:
     if ("hex value" in problem or "Unescaped" in problem) and "\\" in line:
         path = re.search(r"\"([^\"]*)\"?", line)
         return f'{BACKSLASHES} Write "{with_slashes(path[1])}".' if path and len(path[1]) < 120 else BACKSLASHES
+    if re.search("[“”„‟]", line):
+        return 'Put straight quotes (") in place of the curly ones of a text program.'
     if value in ("True", "False", "yes", "no", "Yes", "No"):
         return f"Write {'true' if value in ('True', 'yes', 'Yes') else 'false'}."
     if "overwrite" in problem:
@@ -426,6 +428,25 @@ def worth(unit: Any, units: dict[str, float]) -> float | None:
     if not isinstance(unit, str):
         return None
     return units.get(re.sub(r"^([cm]?)(?:enti|illi)?met(?:er|re)s?$", r"\1m", unit.strip().lower()).removesuffix("es"))
+
+
+_STATURES_M = (0.3, 3.0)
+
+
+def stature_of(text: str | float) -> float:
+    """A stature [m] as people write it: "1.75", "1,75", "175", "175 cm", "1.75 m"; a number above 3 is centimetres.
+
+    Raises
+    ------
+    ObservationError
+        No number, another unit than of length, or a person of less than 0.3 or more than 3 m.
+    """
+    found = re.fullmatch(r"(\d+(?:[.,]\d+)?)\s*([a-z]*)", str(text).strip().lower())
+    number = float(found[1].replace(",", ".")) if found else np.nan
+    unit = worth(found[2] or ("m" if number < _STATURES_M[1] else "cm"), LENGTHS) if found else None
+    if unit is None or not _STATURES_M[0] < number * unit < _STATURES_M[1]:
+        raise ObservationError(f"{str(text)!r} is no stature", remedy="Give metres or centimetres: 1.75 or 175.")
+    return round(number * unit, 4)
 
 
 def metres_of(unit: str, error: type[KinefitError], what: str = "unit", **more: Any) -> float:

@@ -10,6 +10,7 @@ from kinefit.app.folders import (
     OUTDATED,
     UNFINISHED,
     TakeFolder,
+    openable_files,
     subfolders,
     takes_below,
     video_files,
@@ -81,3 +82,10 @@ def test_folders_and_videos_of_a_folder(tmp_path):
     assert video_files(tmp_path / "gone") == []
     with pytest.raises(FileError, match="cannot be opened.*moved"):
         subfolders(tmp_path / "gone")
+
+
+def test_what_can_be_opened_is_listed(tmp_path):
+    for name in ("b.c3d", "a.MP4", "take.toml", "0001.png", "notes.docx", "walk.trc"):
+        (tmp_path / name).touch()
+    assert [path.name for path in openable_files(tmp_path)] == ["0001.png", "a.MP4", "b.c3d", "take.toml", "walk.trc"]
+    assert [path.name for path in video_files(tmp_path)] == ["a.MP4"] and openable_files(tmp_path / "none") == []

@@ -20,7 +20,7 @@ from kinefit.batch.corrections import (
     write_edits,
 )
 from kinefit.bodies import load_body
-from kinefit.errors import ExportError, FileError, KinefitError, TakeError
+from kinefit.errors import ExportError, FileError, KinefitError, ObservationError, TakeError
 from kinefit.findings import Edit
 from kinefit.multiview.people import PersonTrack
 from kinefit.observations import ClickFrame
@@ -370,3 +370,13 @@ def test_a_take_that_is_read_only_or_was_changed_in_the_meantime_is_left_alone(t
     take.chmod(0o644)
     write_edits(take, [edit], over=take.read_bytes())
     assert read_take(take).up == "y" and read_take(take).height == 1.7
+
+
+@pytest.mark.parametrize("text", ["1.75", "1,75", "175", "175 cm"])
+def test_a_height_is_written_in_metres_however_it_was_typed(take, text):
+    set_height(take, text)
+    assert read_take(take).height == 1.75
+    set_height(take, "")
+    assert read_take(take).height is None
+    with pytest.raises(ObservationError, match="1.75 or 175"):
+        set_height(take, "tall")

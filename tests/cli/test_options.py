@@ -134,7 +134,7 @@ OWN = {
     "markers": {
         "sigma": "sigma = 0.05", "unit": 'unit = "mm"', "set": 'set = "no such"', "model": 'model = "none.npz"',
         "shift": "shift = [0.1, 0.0, 0.0]", "turn": "turn = [0.0, 10.0, 0.0]",
-        "time_offset": "time_offset = 0.2", "sides": 'sides = "exchanged"',
+        "time_offset": "time_offset = 0.2", "sides": 'sides = "exchanged"', "static": 'static = "none.trc"',
     },
     "depth": {
         "sigma": "sigma = 0.2", "unit": "unit = 0.0011", "range": "range = [0.5, 2.0]", "rate": "rate = 5.0",

@@ -166,12 +166,6 @@ def test_an_out_that_cannot_be_written_is_refused_before_any_work(take, words):
     assert "Give another" in told.stderr and words[-2] in told.stderr
 
 
-def test_fbx_is_answered_with_glb_and_bvh():
-    for words in (("export", "motion.npz", "--to", "fbx"), ("track", "take.toml", "--formats", "fbx")):
-        told = run(*words)
-        assert told.exit_code == 2 and "use glb or bvh" in told.stderr
-
-
 @pytest.mark.parametrize(
     ("words", "meant"),
     [
@@ -281,3 +275,35 @@ def test_a_take_of_an_editor_of_windows_is_read(take):
     take.unlink()
     take.with_name("monday.toml").write_bytes(b"\xef\xbb\xbf" + text.encode())
     assert read_take(take.parent).path.name == "monday.toml"
+
+
+@pytest.mark.parametrize("words", [("track",), ("init",), ("check",), ("view",), ("export", "--to", "bvh"), ("app",)])
+def test_an_address_is_no_file(words):
+    told = run(words[0], "https://example.org/walk.mp4", *words[1:])
+    assert told.exit_code == 2 and "is an address" in told.stderr and "Download it" in told.stderr
+
+
+@pytest.mark.parametrize("words", [("track",), ("init",)])
+def test_several_files_belong_into_a_folder(take, words):
+    told = run(*words, take.with_name("cam01.mp4"), take.with_name("cam02.mp4"))
+    assert told.exit_code == 2 and "folder of its own" in told.stderr
+    assert "folder of its own" not in run("track", take, "--no-report", "nonsense").stderr
+
+
+def test_a_take_with_a_hidden_ending_is_named(take):
+    take.rename(take.with_name("take.toml.txt"))
+    told = run("check", take.parent)
+    assert told.exit_code == 2 and "Rename take.toml.txt to take.toml" in told.stderr
+
+
+@pytest.mark.parametrize("words", [("calibrate", "people"), ("markers", "fit")])
+def test_an_impossible_height_says_how_to_write_it(take, words):
+    told = run(*words, take, "--height", "17,5")
+    assert told.exit_code == 2 and "metres or centimetres: 1.75 or 175" in told.stderr
+
+
+def test_a_folder_around_results_names_them(tmp_path):
+    write_motion(cut(squat_and_wave(), 0, 2), tmp_path / "take-kinefit" / "motion.npz")
+    told = run("export", tmp_path, "--to", "bvh")
+    assert told.exit_code == 2 and "take-kinefit" in told.stderr
+    assert run("export", tmp_path / "take-kinefit", "--to", "bvh").exit_code == 0

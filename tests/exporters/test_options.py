@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from tests.exporters.synthetic import smooth_motion
 
 from kinefit.bodies import load_body
+from kinefit.bodies.joint_names import CHARACTER_BONES, segment_names
 from kinefit.errors import ExportError
 from kinefit.exporters import tables, write_bvh, write_c3d, write_csv, write_glb, write_trc, write_usd
 from kinefit.exporters.skeletons.common import NAMES, bone_names
@@ -221,7 +222,7 @@ def test_every_segment_of_the_catalogue_has_a_name_of_its_own(name, names):
     body = load_body(name)
     found = bone_names(body, names, "")
     assert len(set(found)) == len(body.tree.segments)
-    assert names == "kinefit" or set(body.aliases[names]) == set(body.tree.segments)
+    assert names == "kinefit" or set(segment_names(body, names)) == set(body.tree.segments)
 
 
 def test_sides_are_kept_in_every_convention():
@@ -231,7 +232,8 @@ def test_sides_are_kept_in_every_convention():
         for segment, bone in bones.items():
             if segment.endswith("_r"):
                 left = bones[segment[:-2] + "_l"]
-                assert {bone.replace("Right", "Left"), re.sub("_r$", "_l", bone), re.sub("^r", "l", bone)} & {left}
+                sides = (("Right", "Left"), ("^right", "left"), ("_r$", "_l"), ("^r", "l"))
+                assert left in {re.sub(right, other, bone) for right, other in sides}
 
 
 def test_names_that_programs_look_for():
@@ -241,6 +243,32 @@ def test_names_that_programs_look_for():
     assert {"root", "lowerback", "lfemur", "rhumerus", "lclavicle"} <= set(bones["cmu"])
     assert {"pelvis", "torso", "femur_l", "calcn_r"} <= set(bones["opensim"])
     assert {"humanoid_root", "l_hip", "r_talocrural", "vl5"} <= set(bones["hanim"])
+    assert {"hips", "spine", "chest", "head", "leftUpperLeg", "rightToes", "leftLowerArm"} <= set(bones["vrm"])
+    assert {"Hips", "Spine", "Chest", "Head", "LeftUpperLeg", "RightToes", "LeftLowerArm"} <= set(bones["unity"])
+    assert {"pelvis", "spine_01", "spine_03", "thigh_l", "calf_r", "ball_l", "lowerarm_r"} <= set(bones["unreal"])
+
+
+def test_fingers_and_the_face_have_the_bones_of_characters():
+    """The thumb's metacarpal is "proximal" in Unity, whose HumanBodyBones has no such bone."""
+    body = load_body("humanoid_hands")
+    thumbs = {
+        names: [segment_names(body, names)[f"thumb_{bone}_l"] for bone in ("metacarpal", "proximal", "distal")]
+        for names in CHARACTER_BONES
+    }
+    assert thumbs == {
+        "vrm": ["leftThumbMetacarpal", "leftThumbProximal", "leftThumbDistal"],
+        "unity": ["LeftThumbProximal", "LeftThumbIntermediate", "LeftThumbDistal"],
+        "unreal": ["thumb_01_l", "thumb_02_l", "thumb_03_l"],
+    }
+    face = load_body("humanoid_face")
+    assert segment_names(face, "vrm")["jaw"] == "jaw" and segment_names(face, "unity")["eye_r"] == "RightEye"
+
+
+def test_bones_of_characters_follow_from_the_names_for_bvh_and_a_body_may_state_its_own(motion):
+    """A motion file of an older version, or a body of one's own, has no names of game engines."""
+    renamed = replace(motion.body, aliases={"bvh": {"shank_l": "LeftLeg", "foot_l": "own"}, "unreal": {"foot_l": "f"}})
+    assert segment_names(renamed, "unreal")["shank_l"] == "calf_l" and segment_names(renamed, "unreal")["foot_l"] == "f"
+    assert segment_names(load_body("humanoid10"), "unreal")["torso"] == "pelvis"
 
 
 @pytest.mark.parametrize(
@@ -253,7 +281,7 @@ def test_names_that_programs_look_for():
         (write_usd, {"up": "x"}, "'x'; there are: y, z"),
         (write_usd, {"unit": "km"}, "'km'; there are: m, cm, mm"),
         (write_trc, {"up": "q"}, "'q'; there are: x"),
-        (write_csv, {"names": "unity"}, "'unity'; there are"),
+        (write_csv, {"names": "biped"}, "'biped'; there are"),
     ],
 )
 def test_options_that_do_not_exist_are_refused_and_nothing_is_written(motion, tmp_path, write, options, problem):

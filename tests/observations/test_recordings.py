@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ObservationError
-from kinefit.observations import KeypointFrame, Keypoints
+from kinefit.observations import KeypointFrame, Keypoints, Markers
 
 NAMES = ("nose", "left_hip", "right_hip", "left_alone")
 
@@ -38,3 +38,16 @@ def test_frames_without_detections_show_nobody():
 def test_known_sides_are_of_every_frame():
     with pytest.raises(ObservationError, match="known sides"):
         Keypoints("a", "", ("nose",), 10.0, np.zeros((3, 1, 1, 2)), np.ones((3, 1, 1)), sides_known=np.ones(2, bool))
+
+
+def test_empty_ends_of_markers_are_left_out_and_said():
+    x = np.ones((10, 2, 3))
+    x[:3], x[5], x[9] = np.nan, np.nan, np.nan
+    whole = Markers(("A", "B"), 10.0, x, residual=np.zeros((10, 2)), first_frame=11)
+    cut = whole.trimmed()
+    assert whole.seen_frames == (3, 9) and len(cut) == len(cut.residual) == 6 and cut.first_frame == 14
+    np.testing.assert_allclose(cut.times, whole.times[3:9])
+    assert cut.notes == ("no markers in the first 3 and last 1 of 10 frames: left out",)
+    assert cut.trimmed() is cut and np.isnan(cut.positions[2]).all()  # a gap between stays
+    none = Markers(("A",), 10.0, np.full((4, 1, 3), np.nan))
+    assert none.trimmed() is none

@@ -12,7 +12,7 @@ from kinefit.bodies.surfaces import segment_middles
 from kinefit.frame.fit import rows_of
 from kinefit.frame.results import ROOT_PRIOR_STD
 from kinefit.geometry.camera import Rig
-from kinefit.rows import Rows
+from kinefit.rows import PairRows, ParameterRows, Rows
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import squat_and_wave
@@ -143,3 +143,36 @@ def middle_of(scene, body, segment):
     mesh = body_mesh(body)
     middle = segment_middles(mesh.vertices, mesh.segment, len(body.tree.segments))[segment]  # in the world at rest
     return scene.frames[segment, :9].reshape(3, 3) @ middle + scene.frames[segment, 9:]
+
+
+class Bound(Matched):
+    """Three rows between the hands, or on three angles, each off by its own constant error."""
+
+    sensor, of_points, channels, lasts = "bound", True, ("a", "b", "c"), 0.0
+
+    def __init__(self, pairs):
+        self.pairs = pairs
+
+    def rows(self, scene):
+        errors, weight = np.array([0.01, -0.02, 0.03]), np.full(3, 1.0 / 0.02**2)
+        if not self.pairs:
+            return [ParameterRows(np.array([8, 11, 14]), errors, weight)]
+        hands = [scene.body.tree.segment(name) for name in ("hand_r", "hand_l")]
+        poses = scene.body.tree.segment_poses(scene.state.T_world_root[None], scene.state.angles[None])[0, hands, :3, 3]
+        a, b = np.repeat(poses[:, None], 3, axis=1)
+        return [PairRows(np.tile(hands, (3, 1)), a, b, np.eye(3), errors, weight)]
+
+
+@pytest.mark.parametrize("pairs", [True, False])
+def test_rows_between_segments_and_on_angles_have_errors_that_last(tracked, pairs):
+    body, _, take, _ = tracked
+    T = len(take.roots)
+    others = replace(take.others, scale={})
+    found = sensor_noise.noise_of_sensors(replace(take, others=others), [(Bound(pairs),)] * T, half=HALF)
+    scene = others.scene(4, take.roots, take.angles)
+    (rows,) = rows_at(Bound(pairs), scene)
+    J = design(body, scene.state, rows)
+    np.testing.assert_allclose(sensor_noise.square(found.information[4]), J.T @ J / 0.02**2, atol=1e-6)
+    of = found.components["bound"]
+    assert (of.bias > 0.0).all() and (of.jitter < 1e-9).all()
+    assert np.linalg.norm(found.pushes(4).constant) > 0.0

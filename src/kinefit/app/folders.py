@@ -13,9 +13,10 @@ from typing import Any
 from kinefit._files import read_npz
 from kinefit.batch.viewed import is_outdated
 from kinefit.errors import FileError, KinefitError, printable
-from kinefit.readers.depth.images import natural
+from kinefit.readers.depth.images import PICTURES, natural
 from kinefit.readers.guess.files import VIDEOS
 from kinefit.readers.take.file import read_take, takes_in
+from kinefit.readers.video import ENDINGS
 
 NEW = "new"
 UNFINISHED = "unfinished"
@@ -103,8 +104,17 @@ def is_result(folder: Path) -> bool:
 
 def video_files(folder: Path) -> list[Path]:
     """Video files directly in a folder, by name; empty if it cannot be read."""
+    return _files_of(folder, VIDEOS)
+
+
+def openable_files(folder: Path) -> list[Path]:
+    """Files directly in a folder of which a take can be made, and takes, by name; empty if it cannot be read."""
+    return _files_of(folder, {*VIDEOS, *ENDINGS, *PICTURES, ".c3d", ".trc", ".mcap", ".npy", ".toml"})
+
+
+def _files_of(folder: Path, kinds: set[str]) -> list[Path]:
     try:
-        return sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS and path.is_file())
+        return sorted(path for path in folder.iterdir() if path.suffix.lower() in kinds and path.is_file())
     except OSError:
         return []
 

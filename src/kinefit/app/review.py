@@ -15,7 +15,7 @@ from kinefit.app.served import ScenePage
 from kinefit.batch.viewed import content_of, gather, has_same_cameras
 from kinefit.errors import ObservationError
 from kinefit.exporters.pictures.overlay import draw_overlay
-from kinefit.exporters.report.angles import RangeChange, range_changes, with_error
+from kinefit.exporters.report.angles import RangeChange, all_ranges, range_changes, with_error
 from kinefit.exporters.tables import curves, spoken
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
@@ -62,6 +62,7 @@ class Review(OpenResult):
     Attributes
     ----------
     motion : Motion
+    ranges : of all angles that were observed, as rows of the report's table
     has_cameras : whether the calibration is still the motion's; if not, images are shown without the fit
     scene : ScenePage, whose player has the clock of the page
 
@@ -78,6 +79,7 @@ class Review(OpenResult):
         self.take = last_found(replace(read_take(take), hide_faces=hide_faces))
         self.seen = load_observations(self.take)
         self.has_cameras = has_same_cameras(self.motion, self.take)
+        self.ranges = [one.row for one in all_ranges(self.motion)]
         self._videos = ShownVideos(self.take, self.seen)
         self._reading = threading.Lock()
         self.scene = ScenePage(content_of([self.motion], self.take, self.seen, find=False), with_panel=False)

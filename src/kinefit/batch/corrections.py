@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from kinefit._files import read_bytes, regular, write_bytes, write_text, writing
+from kinefit._files import read_bytes, regular, stature_of, write_bytes, write_text, writing
 from kinefit.bodies import load_body
 from kinefit.errors import ExportError, KinefitError, TakeError, choices, located
 from kinefit.exporters.take_text import edited, quoted
@@ -78,9 +78,10 @@ def choose_person(take: TakePath, person: int | str | None) -> None:
     write_edits(take, [Edit("take", "person", value)])
 
 
-def set_height(take: TakePath, height: float | None) -> None:
-    """State the person's height [m]; None: it is not stated."""
-    write_edits(take, [Edit("take", "height", None if height is None else f"{float(height)!r}")])
+def set_height(take: TakePath, height: float | str | None) -> None:
+    """State the person's height [m], or a text that `stature_of` reads: "175 cm"; None or "": it is not stated."""
+    metres = stature_of(height) if isinstance(height, str) and height else height
+    write_edits(take, [Edit("take", "height", f"{float(metres)!r}" if metres else None)])
 
 
 def can_undo(take: TakePath) -> bool:

@@ -63,7 +63,7 @@ OPTIONS = ("unit", "up", "names", "rest")
 
 _UNITS, _RESTS, _UPS = ("m", "cm", "mm"), ("body", "t"), ("x", "y", "z", "-x", "-y", "-z")
 _Y_UPS, _Z_UPS = ("y", "x", "z", *_UPS[3:]), ("z", "x", "y", *_UPS[3:])
-_JOINTS = ("kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh")
+_JOINTS = ("kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh", "vrm", "unity", "unreal")
 _BVH, _HANIM = ((first, *(name for name in _JOINTS if name != first)) for first in ("bvh", "hanim"))
 _OPENSIM = "OpenSim files are in metres, y up, with the names of the body's coordinates"
 
@@ -86,6 +86,8 @@ FORMATS = Extensions("kinefit.exporters", MotionFormat, "format", dict([
     _own("bvh", "motion.bvh", "animated skeleton for animation programs", ("cm", "m", "mm"), _Y_UPS, _BVH, _RESTS),
     _own("glb", "motion.glb", "animated figure for browsers and game engines", (), (), _JOINTS, _RESTS,
          why="GLB is in metres and y up by its specification"),
+    _own("fbx", "motion.fbx", "animated figure for Unreal, Unity, Maya, MotionBuilder", ("cm", "m", "mm"), ("y", "z"),
+         _JOINTS, _RESTS, why="kinefit writes FBX with y or z up"),
     _own("usd", "motion.usdc", "animated figure for film and simulation programs", _UNITS, ("y", "z"), _JOINTS,
          _RESTS, why="USD supports only y and z up"),
     _own("c3d", "motion.c3d", "joint centres and landmarks for motion laboratories", ("mm", "cm", "m"), _UPS,
@@ -111,6 +113,7 @@ DEFAULT_FORMATS = ("motion", "csv", "bvh", "glb", "trc", "mot", "osim")
 
 _OTHER_RESULTS = {
     "overlays": "videos with the fitted skeleton",
+    "markers": "markers as measured, for OpenSim beside body.osim",
     "montage": "one image of all cameras",
     "report": "results with error bars and findings, as a page for the browser",
 }

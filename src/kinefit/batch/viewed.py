@@ -174,12 +174,9 @@ def _fitting(file: Path | None, name: str, tell: Tell) -> tuple[Take, Observatio
 
 def _in_folder(folder: Path) -> tuple[Path, Path | None]:
     """The motion file in a folder of results, and the take that it probably came from."""
-    from kinefit.errors import FileError
+    from kinefit.readers.motion import find_motion
 
-    file = folder / "motion.npz"
-    if not file.is_file():
-        remedy = "Give the folder that `kinefit track` wrote, or a motion file."
-        raise FileError("this folder has no motion.npz", file=folder, remedy=remedy)
+    file = find_motion(folder)
     name = folder.absolute().name
     places = [folder.absolute().with_name(f"{name.removesuffix('-kinefit')}.toml"), folder / "take" / "take.toml"]
     return file, next((place for place in places if place.is_file()), None)

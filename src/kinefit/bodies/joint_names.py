@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
+from kinefit.bodies.body import Body
 from kinefit.bodies.limbs import FACE
 from kinefit.bodies.toml.bodies import read_toml_body
 from kinefit.errors import BodyError, ObservationError, choices
@@ -183,12 +184,13 @@ VRM0_FINGERS = _fingers("{side}*#", "Thumb Index Middle Ring Little", _UNITY)
 """Names of VRM 0 and of Unity's humanoid, in which "proximal" is the thumb's metacarpal."""
 VRM1_FINGERS = _fingers("{side}*#", "Thumb Index Middle Ring Little", _UNITY, "Metacarpal Proximal Distal")
 """Names of VRM 1."""
+_UNREAL_FINGERS = _fingers("*_0#_{s}", "thumb index middle ring pinky")
 
 _FINGER_NAMES = (
     _fingers("{Side}Hand*#", "Thumb Index Middle Ring Pinky"),  # Mixamo, MotionBuilder
     VRM1_FINGERS,
     VRM0_FINGERS,
-    _fingers("*_0#_{s}", "thumb index middle ring pinky"),  # Unreal
+    _UNREAL_FINGERS,
     _fingers("*.0#.{S}", "thumb f_index f_middle f_ring f_pinky"),  # Rigify
     _fingers("CC_Base_{S}_*#", "Thumb Index Mid Ring Pinky"),  # iClone
     _fingers("{S} Finger*#", "0 1 2 3 4", " 1 2"),  # Biped
@@ -196,14 +198,45 @@ _FINGER_NAMES = (
 )
 
 
+def _bones(family: str) -> dict[str, str]:
+    return next(known.joints for known in FAMILIES if known.name == family)
+
+
+def _capitalised(names: Mapping[str, str]) -> dict[str, str]:
+    return {segment: name[0].upper() + name[1:] for segment, name in names.items()}
+
+
+_VRM_BONES = _bones("VRM, Unity") | {segment: names[0] for segment, names in FACE.items()}
+
+CHARACTER_BONES = {
+    "vrm": _VRM_BONES | VRM1_FINGERS,
+    "unity": _capitalised(_VRM_BONES | VRM0_FINGERS),
+    "unreal": _bones("Unreal") | _UNREAL_FINGERS,
+}
+"""Convention -> segment of the humanoid -> bone: VRM 1, HumanBodyBones of Unity, the mannequin of Unreal."""
+
+
 @cache
 def conventions() -> tuple[NamingConvention, ...]:
     """`FAMILIES`, and the conventions in which motions are exported ("mixamo", "hanim", ...)."""
     out = list(FAMILIES)
     body = read_toml_body("humanoid_hands")
-    for name, names in {**body.aliases, "kinefit": {s: s for s in body.tree.segments}}.items():
+    for name, names in {**body.aliases, **CHARACTER_BONES, "kinefit": {s: s for s in body.tree.segments}}.items():
         out.append(_ExplicitNaming(name, names))
     return tuple(out)
+
+
+def humanoid_segments(body: Body) -> dict[str, str]:
+    """Segment of a body -> its name in the humanoid, by the body's names for BVH; without one its own name."""
+    segments = {bone: segment for segment, bone in read_toml_body("humanoid_hands").aliases["bvh"].items()}
+    return {segment: segments.get(body.alias("bvh", segment), segment) for segment in body.tree.segments}
+
+
+def segment_names(body: Body, convention: str) -> dict[str, str]:
+    """Segment of a body -> its name in a convention: as the body file states, else as in `CHARACTER_BONES`."""
+    bones = CHARACTER_BONES.get(convention, {})
+    found = {own: bones[segment] for own, segment in humanoid_segments(body).items() if segment in bones}
+    return found | dict(body.aliases.get(convention, {}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,11 +371,11 @@ def recorded_joints(names: Sequence[str], table: Mapping[str, str] | None = None
         wanted = {role: wanted.get(role, "") for role in known if role not in ENDS or role in wanted}
     else:
         short = {family: [n for n in family.recorded.values() if find(names, n) is None] for family in FAMILIES}
-        exact = {family: sum(n not in names for n in family.recorded.values()) for family in FAMILIES}
-        family = min(FAMILIES, key=lambda f: (len(short[f]) / len(f.recorded), exact[f]))
+        spelled = {family: sum(n not in names for n in family.recorded.values()) for family in conventions()}
+        family = min(FAMILIES, key=lambda f: (len(short[f]) / len(f.recorded), spelled[f]))
         exported = (f for f in conventions() if isinstance(f, _ExplicitNaming))
         own = (f for f in exported if all(find(names, n) is not None for n in f.recorded.values()))
-        family = next(own, family) if short[family] else family
+        family = min(own, key=lambda f: spelled[f], default=family) if short[family] else family
         wanted = family.recorded
     missing = {role: name for role, name in wanted.items() if find(names, name) is None}
     if missing:

@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import click
@@ -125,6 +126,8 @@ def _meant(error: click.UsageError, words: Sequence[str]) -> str:
             found.append(f"{option} {value or next((word for word in words[k + 1 :] if word != '='), '')}".strip())
     if found:
         return f" Did you mean {' '.join(found)}?"
+    if "unexpected extra argument" in error.message and sum(Path(word).is_file() for word in words) > 1:
+        return " Put the files of one recording into a folder of its own, and name the folder."
     if isinstance(error, click.MissingParameter) and isinstance(error.param, click.Option) and error.param.metavar:
         return f" Give {error.param.opts[0]} {error.param.metavar}."
     return ""

@@ -29,8 +29,33 @@ if TYPE_CHECKING:
 
     from kinefit.findings import Finding
 
-PATH = click.Path(path_type=Path)
-"""Type of arguments and options that are files or folders."""
+class _Path(click.Path):
+    """A file or folder of this computer."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path; an address of the network is refused."""
+        if isinstance(value, str) and "://" in value:
+            self.fail(f"{value!r} is an address, not a file or folder here. Download it, and name what you saved.")
+        return super().convert(value, param, ctx)
+
+
+class _Height(click.ParamType):
+    """A stature, as people write it."""
+
+    name = "height"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """[m]."""
+        from kinefit._files import stature_of
+
+        try:
+            return stature_of(value)
+        except KinefitError as error:
+            self.fail(str(error), param, ctx)
+
+
+PATH, HEIGHT = _Path(path_type=Path), _Height()
+"""Types of arguments and options that are files or folders; that are statures, in metres or centimetres."""
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
@@ -284,10 +309,7 @@ class CommandGroup(click.Group):
 
 def no_format(name: str, valid: Iterable[str]) -> str:
     """What to say of a format that there is not."""
-    problem = choices("format", name, valid)
-    if name.lower().strip(".") == "fbx":
-        return f"{problem}. kinefit does not write FBX: use glb or bvh, which Blender, Unity and Unreal import"
-    return f"{problem}. {install('format')}"
+    return f"{choices('format', name, valid)}. {install('format')}"
 
 
 def check_folder(folder: Path, option: str = "--out") -> None:

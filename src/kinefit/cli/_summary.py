@@ -51,7 +51,7 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
         never = [name for name, frames in gone.items() if len(frames) == len(motion) - len(unobserved)]
         if never:
             names = ", ".join(_hands_together(motion, {n: gone[n] for n in never}))
-            say(f"{'lost in all frames' if label == 'lost' else 'no markers in any frame on'}: {names}")
+            say(f"{'lost in all frames' if label == 'lost' else 'not observed, as they have no markers'}: {names}")
         for name, frames in _hands_together(motion, {n: f for n, f in gone.items() if n not in never}).items():
             say(f"{label}: {name} in frames {frame_ranges(frames)}")
     lengths = [f"{name} {label}" for name, label in bone_lengths(motion).items()]
@@ -85,11 +85,15 @@ def print_files(files: Mapping[str, Path]) -> None:
 
 def lost_segments(motion: Motion) -> dict[str, NDArray]:
     """Segments that are lost, and in which frames somebody was tracked all the same; not those that bore no markers."""
-    gone = motion.lost & (motion.quality > 0)[:, None]
-    for name, frames in without_markers(motion).items():
-        gone[frames, motion.body.tree.segment(name)] = False
-    lost = {name: np.flatnonzero(gone[:, s]) for s, name in enumerate(motion.body.tree.segments)}
-    return {name: frames for name, frames in lost.items() if len(frames)}
+    from kinefit.exporters.report.moments import unmarked
+
+    return _frames_of(motion, motion.lost & (motion.quality > 0)[:, None] & ~unmarked(motion))
+
+
+def _frames_of(motion: Motion, gone: NDArray) -> dict[str, NDArray]:
+    """Segments -> frames in which flags (F, S) are set; without those that have none."""
+    frames = {name: np.flatnonzero(gone[:, s]) for s, name in enumerate(motion.body.tree.segments)}
+    return {name: at for name, at in frames.items() if len(at)}
 
 
 def _hands_together(motion: Motion, gone: Mapping[str, NDArray]) -> dict[str, NDArray]:
@@ -104,20 +108,10 @@ def _hands_together(motion: Motion, gone: Mapping[str, NDArray]) -> dict[str, ND
 
 
 def without_markers(motion: Motion) -> dict[str, NDArray]:
-    """Segments that markers alone would tell, in frames of which none is seen: they hang on their neighbours.
+    """Segments without markers, in frames of which none is seen: they hang on their neighbours."""
+    from kinefit.exporters.report.moments import unmarked
 
-    Empty where other sensors looked too.
-    """
-    markers = [r for r in motion.residuals.values() if r.of_points and r.unit == "m"]
-    if not markers or len(markers) < len(motion.residuals):
-        return {}
-    seen = np.zeros((len(motion), len(motion.body.tree.segments)), bool)
-    for r in markers:
-        for s in np.unique(r.segments):
-            seen[:, s] |= np.isfinite(r.norms[:, r.segments == s]).any(axis=1)
-    bare = motion.lost & ~seen & (motion.quality > 0)[:, None]
-    found = {name: np.flatnonzero(bare[:, s]) for s, name in enumerate(motion.body.tree.segments)}
-    return {name: frames for name, frames in found.items() if len(frames)}
+    return _frames_of(motion, unmarked(motion))
 
 
 def bone_lengths(motion: Motion) -> dict[str, str]:

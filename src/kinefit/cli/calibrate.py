@@ -324,7 +324,8 @@ Examples:
 @click.argument("take", type=_screen.PATH)
 @click.option("-o", "--out", type=_screen.PATH, help="File to write.  [default: TAKE-people.toml]")
 @click.option(
-    "--height", type=float, metavar="M", help="Stature of the person, which sets the scale.  [default: the take's]"
+    "--height", type=_screen.HEIGHT, metavar="M",
+    help="Stature of the person, which sets the scale.  [default: the take's]",
 )
 @click.option("--focal", is_flag=True, help="Estimate the focal lengths too.")
 @click.option("--time-offsets", is_flag=True, help="Estimate the time offset of each camera too.")

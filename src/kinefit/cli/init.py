@@ -81,7 +81,9 @@ def init(
         start_from_clicks(out, points, step, body or "humanoid", browser)
     asked = any(note.about == "rate" and note.sure == "open" for note in guess.notes)
     alone = any(note.about == "cameras" and note.sure == "open" for note in guess.notes)
+    bare = any(note.about == "intrinsics" and note.sure == "open" for note in guess.notes)
     lacking = ["rate (frames per second)"] * asked + ["a second camera, [[depth]] or [[markers]]"] * alone
+    lacking += ["the intrinsics of the depth camera"] * bare
     first = f"Add {' and '.join(lacking)} to it. Then" if lacking else "Next"
     _screen.say(f"\n{out}: written. {first}:\n  {command('check', out)}\n  {command('track', out)}")
 
@@ -94,8 +96,9 @@ def write_first_take(folder: Path) -> Path:
     guess, out = guess_take(folder), folder / "take.toml"
     text = guess.text
     if sys.stdin.isatty() and "[calibration]" not in text:  # lengths then hang on the height alone
-        asked = "Height of the person in metres; 0 where you do not know it"
-        height = click.prompt(asked, type=click.FloatRange(0.0, 2.8))
+        asked = "Height of the person, in metres or centimetres; Enter where you do not know it"
+        known = lambda answer: _screen.HEIGHT.convert(answer, None, None) if answer.strip() not in ("", "0") else 0.0
+        height = click.prompt(asked, default="", show_default=False, value_proc=known)
         text = text.replace(f"# {OPEN_HEIGHT}", f"height = {height:g}") if height else text
     write_text(out, text)
     show(guess.notes)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, load_body
-from kinefit.diagnostics import cameras, images, lenient, mistakes, person, rig, timing, views
+from kinefit.diagnostics import cameras, frozen, images, lenient, mistakes, person, rig, timing, views
 from kinefit.diagnostics.cameras import CameraBias
 from kinefit.diagnostics.rig import CameraCoverage
 from kinefit.diagnostics.sensors import SensorAlignment
@@ -202,6 +202,11 @@ def _files(c: Checked) -> list[Finding]:
     return found
 
 
+def _frozen(c: Checked) -> list[Finding]:
+    c.observations, found = frozen.without_frozen(c.observations)
+    return found
+
+
 def _covered(c: Checked) -> list[Finding]:
     c.observations, found = images.without_covered(c.take, c.observations)
     return found
@@ -336,6 +341,10 @@ CHECKS = (
     Check("images", _pictures, ("take", "rig"), 0.3, "A dark scene looks like wider black bars."),
     Check("stated image of the keypoints", _image_frames, ("take", "rig"), reads=True),
     Check("files", _files, ("take", "sound"), 0.1, reads=True),
+    Check(
+        "frozen streams", _frozen, ("take", "observations"), 0.6,
+        "A program that fills gaps with the last frame, and a film that was paused look the same.",
+    ),
     Check(
         "covered lens", _covered, ("take", "observations"), 2.0,
         "Darkness, or an object that fills the image, looks like a covered lens.",

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.diagnostics.frozen import without_frozen
 from kinefit.diagnostics.views import MIN_CONFIDENCE
 from kinefit.errors import KinefitError
 from kinefit.findings import Edit, Finding, Severity, listed, runs_of
@@ -137,14 +138,16 @@ def _bars(calibrated: tuple[int, int], size: tuple[int, int]) -> tuple[float, fl
 
 
 def load_uncovered(take: Take) -> Observations:
-    """Load the observations of a take, and drop images of covered depth cameras; its notes name them.
+    """Load the observations of a take without frozen frames and images of covered depth cameras; its notes name them.
 
     Raises
     ------
     KinefitError
         As `load_observations`.
     """
-    seen, found = without_covered(take, load_observations(take))
+    seen, frozen = without_frozen(load_observations(take))
+    seen, covered = without_covered(take, seen)
+    found = (*frozen, *covered)
     return replace(seen, notes=(*seen.notes, *(f"{f.text} {f.remedy.rstrip('.')}" for f in found)))
 
 

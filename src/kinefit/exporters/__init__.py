@@ -13,13 +13,14 @@ from kinefit.exporters.pictures.overlay import (
 )
 from kinefit.exporters.report.report import write_report
 from kinefit.exporters.skeletons.bvh import write_bvh, write_x3d
+from kinefit.exporters.skeletons.fbx import write_fbx
 from kinefit.exporters.skeletons.glb import write_glb, write_usd
 from kinefit.exporters.skeletons.retarget import write_character
 from kinefit.exporters.tables import tables, write_csv, write_parquet
 
 __all__ = [
     "depth_picture", "draw_overlay", "tables", "write_bvh", "write_c3d", "write_character", "write_csv",
-    "write_depth_overlay", "write_glb", "write_jsonl", "write_markers", "write_mcap", "write_montage", "write_mot",
-    "write_motion", "write_nwb", "write_osim", "write_overlay", "write_parquet", "write_report", "write_rrd",
-    "write_trc", "write_usd", "write_x3d",
+    "write_depth_overlay", "write_fbx", "write_glb", "write_jsonl", "write_markers", "write_mcap", "write_montage",
+    "write_mot", "write_motion", "write_nwb", "write_osim", "write_overlay", "write_parquet", "write_report",
+    "write_rrd", "write_trc", "write_usd", "write_x3d",
 ]  # fmt: skip

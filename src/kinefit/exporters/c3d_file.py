@@ -145,7 +145,7 @@ def write_c3d(
     unit : "mm", "cm" or "m"
     up : str, optional
         Vertical axis of the file's world, which POINT:Y_SCREEN tells. Default: the motion's own.
-    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh"
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh", "vrm", "unity" or "unreal"
         Labels of the joint centres: names of their segments; with "kinefit" of the joints.
 
     Raises

@@ -36,7 +36,7 @@ def write_nwb(motion: Motion, path: str | PathLike[str], *, up: str | None = Non
     path : path
     up : str, optional
         Vertical axis of the file's world. Default: the motion's own.
-    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh"
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh", "vrm", "unity" or "unreal"
         Names of the joints; ":" becomes "_": mixamorig_Hips.
 
     Raises
@@ -163,7 +163,7 @@ def write_mcap(motion: Motion, path: str | PathLike[str], *, up: str = "z", name
     path : path
     up : str
         Vertical axis of the world; of ROS it is z.
-    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh"
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh", "vrm", "unity" or "unreal"
         Names of the frames in `/tf`; with "kinefit" those of the segments.
 
     Raises
@@ -215,7 +215,7 @@ def write_rrd(motion: Motion, path: str | PathLike[str], *, up: str | None = Non
     path : path
     up : str, optional
         Vertical axis of the file's world, which it states. Default: the motion's own.
-    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh"
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh", "vrm", "unity" or "unreal"
         Labels of the joints.
 
     Raises

@@ -30,15 +30,22 @@ from kinefit._files import writing
 from kinefit.errors import ExportError, extra
 from kinefit.exporters.opensim import root_coordinates
 from kinefit.exporters.skeletons.common import UNITS, bone_names, euler_zxy, length_factor, turned
-from kinefit.motion import Motion, angle_columns, continuous_quaternions, joint_columns, place_columns
+from kinefit.motion import (
+    Motion,
+    angle_columns,
+    continuous_quaternions,
+    joint_columns,
+    place_columns,
+    rotation_between_up,
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
     """One coordinate over time, as OpenSim calls it: values and standard deviations (F,) in `unit`.
 
-    `speed_std` is that of its rate of change [unit/s], NaN where the motion does not tell it. `coordinate` is its
-    number in `Motion.dof_std`, None for a mixture of several.
+    `speed_std` is that of its rate of change [unit/s], NaN where the motion does not tell it. `slopes` (F, k) are the
+    changes of the value by those of k `coordinates`, numbered as in `Motion.dof_std` [unit/rad, unit/m].
     """
 
     name: str
@@ -47,8 +54,9 @@ class Curve:
     unit: str
     values: NDArray
     std: NDArray
-    speed_std: float = np.nan
-    coordinate: int | None = None
+    speed_std: float
+    coordinates: tuple[int, ...]
+    slopes: NDArray
 
     @property
     def stem(self) -> str:
@@ -60,22 +68,26 @@ def curves(motion: Motion) -> list[Curve]:
     """All coordinates: the root's as OpenSim's ground_pelvis joint has them, y up, then the angles; without jumps."""
     tree, y_up = motion.body.tree, motion.turned("y")
     names, speeds = root_coordinates(motion.body), _speeds(motion)
-    turns, turns_std = _root_turns(y_up)
-    out = []
+    turns, turns_std, slopes = _root_turns(y_up)
+    R, ones, out = rotation_between_up(motion.up, "y"), np.ones((len(motion), 1)), []
+    by_radians = np.degrees(ones)
     if tree.root_free:
         columns = [*turns.T, *y_up.Ts_world_root[:, :3, 3].T]
         stds = [*turns_std.T, *y_up.dof_std[:, :3].T]
         units = ["deg"] * 3 + ["m"] * 3
         turning = float(np.degrees(speeds[3:6].max()))
         fast = [turning] * 3 + [float(speeds[:3].max())] * 3
-        out = [Curve(n, "pelvis", "", *of) for n, *of in zip(names, units, columns, stds, fast)]
+        moved = [(3, 4, 5)] * 3 + [(0, 1, 2)] * 3
+        by = [*(slopes @ R).swapaxes(0, 1), *(ones * row for row in R)]
+        out = [Curve(n, "pelvis", "", *of) for n, *of in zip(names, units, columns, stds, fast, moved, by)]
     for d, name in enumerate(tree.coordinates):
         slides = bool(tree.prismatic[d])
         values, std, speed = motion.angles[:, d], motion.dof_std[:, 6 + d], float(speeds[6 + d])
         if not slides:
             values, std, speed = np.degrees(np.unwrap(values)), np.degrees(std), float(np.degrees(speed))
         joint, _ = split_side(motion.body.joints[tree.owners[d]])
-        out.append(Curve(name, joint, split_side(name)[1], "m" if slides else "deg", values, std, speed, 6 + d))
+        unit, by_own = ("m", ones) if slides else ("deg", by_radians)
+        out.append(Curve(name, joint, split_side(name)[1], unit, values, std, speed, (6 + d,), by_own))
     return out
 
 
@@ -93,23 +105,24 @@ def split_side(name: str) -> tuple[str, str]:
     return (name[:-2] if side else name), side
 
 
-def _root_turns(y_up: Motion) -> tuple[NDArray, NDArray]:
-    """Tilt, list and rotation (F, 3) [deg] with their standard deviations, from those of a turn about the world's axes.
+def _root_turns(y_up: Motion) -> tuple[NDArray, NDArray, NDArray]:
+    """Tilt, list and rotation (F, 3) [deg], their standard deviations, and slopes (F, 3, 3) [deg/rad] by world turns.
 
-    R = Rz Rx Ry, so ω = z ż + Rz x ẋ + Rz Rx y ẏ; the three errors are taken as independent.
+    R = Rz Rx Ry, so ω = z ż + Rz x ẋ + Rz Rx y ẏ; the standard deviations take the three errors as independent.
     """
     angles = euler_zxy(y_up.Ts_world_root[:, :3, :3])
     if not len(angles):
-        return angles, angles
+        return angles, angles, np.zeros((0, 3, 3))
     c, s = np.cos(angles), np.sin(angles)
     J = np.zeros((len(angles), 3, 3))
     J[:, 2, 0] = 1
     J[:, 0, 1], J[:, 1, 1] = c[:, 0], s[:, 0]
     J[:, 0, 2], J[:, 1, 2], J[:, 2, 2] = -s[:, 0] * c[:, 1], c[:, 0] * c[:, 1], s[:, 1]
     known = np.isfinite(y_up.dof_std[:, 3:6]).all(axis=1) & (np.abs(c[:, 1]) > 1e-3)
-    std = np.full((len(angles), 3), np.inf)
-    std[known] = np.sqrt((np.linalg.inv(J[known]) ** 2 @ y_up.dof_std[known, 3:6, None] ** 2)[..., 0])
-    return np.degrees(np.unwrap(angles, axis=0)), np.degrees(std)
+    std, slopes = np.full((len(angles), 3), np.inf), np.zeros(J.shape)
+    slopes[known] = np.degrees(np.linalg.inv(J[known]))
+    std[known] = np.sqrt((slopes[known] ** 2 @ y_up.dof_std[known, 3:6, None] ** 2)[..., 0])
+    return np.degrees(np.unwrap(angles, axis=0)), std, slopes
 
 
 DIGITS = {"thumb": "Thumb"} | {digit: f"{digit.capitalize()} finger" for digit in ("index", "middle", "ring", "little")}
@@ -213,7 +226,7 @@ def tables(
         Of all lengths.
     up : str, optional
         Vertical axis of the tables' world; default: the motion's own.
-    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh", optional
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh", "vrm", "unity" or "unreal", optional
         Joints and segments under these names (a joint bears its segment's); default: the body's own for both.
 
     Raises

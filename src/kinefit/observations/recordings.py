@@ -290,6 +290,24 @@ class Markers:
         """(F,) [s] on the recording's own clock: the first is `first_time`."""
         return np.arange(len(self)) / self.rate + self.first_time
 
+    @property
+    def seen_frames(self) -> tuple[int, int]:
+        """First frame that shows a marker, and one after the last; all frames where none does."""
+        seen = np.flatnonzero(np.isfinite(self.positions[..., 0]).any(axis=1))
+        return (int(seen[0]), int(seen[-1]) + 1) if len(seen) else (0, len(self))
+
+    def trimmed(self) -> Markers:
+        """The recording without empty frames before its first marker and after its last, which `notes` then say."""
+        first, stop = self.seen_frames
+        if (first, stop) == (0, len(self)):
+            return self
+        text = f"no markers in the first {first} and last {len(self) - stop} of {len(self)} frames: left out"
+        return replace(
+            self, positions=self.positions[first:stop], first_time=float(self.times[first]),
+            residual=None if self.residual is None else self.residual[first:stop],
+            first_frame=self.first_frame + first, notes=(*self.notes, text),
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, eq=False)
 class SkeletonMotion:

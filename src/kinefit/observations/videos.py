@@ -410,6 +410,7 @@ class NamedMarkers:
     marker_set : of the body, "" for its landmarks
     time_offset : float [s] added to the times of the markers
     std : (K,) [m] standard deviation of the set's marker places on this person; None if the body has their places
+    trial : Markers, with names of the set: a static trial of the same person
     """
 
     sensor: str
@@ -417,6 +418,7 @@ class NamedMarkers:
     marker_set: str
     time_offset: float = 0.0
     std: NDArray | None = None
+    trial: Markers | None = None
 
     def at(self, time: float) -> MarkerFrame | None:
         """The frame nearest to a time [s]; None if there is none within half a frame."""

@@ -61,9 +61,20 @@ _REMEDY = "Write it again with kinefit, or copy it again from its source."
 
 
 def find_motion(path: str | PathLike[str]) -> Path:
-    """The motion file in a folder of results; any other path unchanged."""
-    inside = Path(path) / "motion.npz"
-    return inside if inside.is_file() else Path(path)
+    """The motion file in a folder of results; any other path unchanged.
+
+    Raises
+    ------
+    FileError
+        A folder without one, with the folders in it that have one.
+    """
+    path = Path(path)
+    inside = path / "motion.npz"
+    if path.is_dir() and not inside.is_file():
+        below = ", ".join(file.parent.name for file in sorted(path.glob("*/motion.npz"))[:10])
+        remedy = f"Name a folder in it: {below}." if below else "Give a folder that `kinefit track` wrote."
+        raise FileError("this folder has no motion.npz", file=path, remedy=remedy)
+    return inside if inside.is_file() else path
 
 
 @checked

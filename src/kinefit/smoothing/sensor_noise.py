@@ -17,15 +17,23 @@ from kinefit.correspondences.closures import every_closure
 from kinefit.frame.fit import ignores_surface_offsets, rows_of_points
 from kinefit.frame.results import ROOT_PRIOR_STD
 from kinefit.frame.skin import skin_of
-from kinefit.rows import DofRows, Rows, weaker
+from kinefit.rows import Rows, weaker
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import ChannelResiduals
 from kinefit.sensors.points.markers import MarkerMatched
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.spool import MATRIX_FRAMES, Spool, stretches
-from kinefit.smoothing.tracked_frames import TrackedFrames, squares_of
+from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.solvers.bundle.border_frames import gram
-from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, point_derivatives, product
+from kinefit.solvers.equations import (
+    block_diagonal,
+    design,
+    inverse,
+    normal_equations,
+    point_derivatives,
+    product,
+    robust_factors,
+)
 from kinefit.solvers.trajectory.variance_components import VarianceComponents, variance_components
 
 _RIGID_SURFACE_STDS = 1e-6, 1e-6  # [m], [rad] of surface offsets of a body without joints: it is its surface
@@ -226,10 +234,10 @@ def _of_rows(
         scene, surface, pushed = others.scene(f, take.roots, take.angles), list[Rows](), list[tuple[str, _Push]]()
         for m in matched[f]:
             scale = others.scale.get(m.sensor, 1.0)
-            made = [r for r in rows_at(m, scene) if isinstance(r, Rows | DofRows) and len(r)]
-            points = [r for r in made if m.of_points or isinstance(r, DofRows)]
+            made = [r for r in rows_at(m, scene) if r.weight.ndim == 1 and len(r)]
+            points = [r for r in made if m.of_points or not isinstance(r, Rows)]
             surface += [weaker(r, scale) for r in made if isinstance(r, Rows) and not m.of_points]
-            weights = [r.weight * squares_of(r)[1] / scale**2 for r in points]
+            weights = [r.weight * robust_factors(r)[0] / scale**2 for r in points]
             for rows, w, at in zip(points, weights, residuals.add(f, m, points, [r.residual for r in points], weights)):
                 used = w > 0.0
                 J, w, at = design(body, scene.state, rows)[used], w[used], at[:, used]

@@ -194,7 +194,8 @@ def _by_markers(person: SizedPerson, height: float | None, progress: Progress | 
     r, body, worn = person.recording, person.subject.body, person.recording.markers[0]
     name, points = worn.marker_set, body.markers(worn.marker_set)
     placed = name if worn.std is None else MarkerPlacement(name, points, worn.std)
-    found = fit_marker_subject(body, worn.markers, placed, height=height, progress=progress)
+    trials = [worn.trial, worn.markers] if worn.trial is not None else [worn.markers]
+    found = fit_marker_subject(body, trials, placed, height=height, progress=progress)
     each = {f"{worn.sensor} {name}": float(s) for name, s in zip(found.points.names, found.sigma)}
     person = replace(person, recording=replace(r, sigma={**r.sigma, **each}))
     return person.with_markers(found, found.body)

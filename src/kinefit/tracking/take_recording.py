@@ -27,6 +27,7 @@ from kinefit.observations import (
     DepthFrame,
     DepthVideo,
     KeypointVideo,
+    Markers,
     NamedMarkers,
     SilhouetteFrame,
     by_record,
@@ -282,18 +283,23 @@ def _motion_start(take: Take, body: Body) -> tuple[int, BodyState]:
 def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMarkers], Body]:
     """All marker recordings by the names of the body's sets; a set of the catalogue is put on the body where needed."""
     out = []
-    for k, (entry, markers) in enumerate(zip(take.markers, seen.markers)):
+    for k, (entry, markers, trial) in enumerate(zip(take.markers, seen.markers, seen.static_markers, strict=True)):
         with located(entry.file, f"[[markers]] {k + 1}"):
             own, known, std = _set_of(body, markers.names, entry.set)
         if own and own not in body.marker_sets:
             body = replace(body, marker_sets={**body.marker_sets, own: known})
-        names = tuple(n or bare(label) for label, n in zip(markers.names, matched(markers.names, known.names)))
-        here = [i for i, n in enumerate(names) if n in known.names]
-        named = replace(
-            markers, names=tuple(names[i] for i in here), positions=markers.positions[:, here]
-        )
-        out.append(NamedMarkers(sensor_name("markers", take.markers, k), named, own, entry.time_offset, std))
+        named, trial = _named_as(markers, known.names), trial and _named_as(trial, known.names)
+        out.append(NamedMarkers(sensor_name("markers", take.markers, k), named, own, entry.time_offset, std, trial))
     return out, body
+
+
+def _named_as(markers: Markers, known: Sequence[str]) -> Markers:
+    """The markers that a set knows, by its names."""
+    names = matched(markers.names, known)
+    here = [i for i, (label, name) in enumerate(zip(markers.names, names)) if (name or bare(label)) in known]
+    return replace(
+        markers, names=tuple(names[i] or bare(markers.names[i]) for i in here), positions=markers.positions[:, here]
+    )
 
 
 def label_findings_of(take: Take, seen: Observations, body: Body, *, refuse: bool = False) -> tuple[Finding, ...]:
@@ -305,8 +311,10 @@ def label_findings_of(take: Take, seen: Observations, body: Body, *, refuse: boo
         With `refuse`: the sides of a recording are wrong.
     """
     out: list[Finding] = []
-    for k, (entry, markers) in enumerate(zip(take.markers, seen.markers)):
-        with located(entry.file, f"[[markers]] {k + 1}"):
+    of_entries = zip(take.markers, seen.markers, seen.static_markers, strict=True)
+    each = [(k, e, file, m) for k, (e, *two) in enumerate(of_entries) for file, m in zip((e.file, e.static), two) if m]
+    for k, entry, file, markers in each:
+        with located(file, f"[[markers]] {k + 1}"):
             found: tuple[Finding, ...] = ()
             with suppress(KinefitError):  # which tracking raises
                 own, points, std = _set_of(body, markers.names, entry.set)

@@ -33,7 +33,7 @@ def run(*args):
     return CliRunner().invoke(main, [str(arg) for arg in args])
 
 
-@pytest.mark.parametrize("format", ["bvh", "glb", "trc", "mot", "osim", "c3d"])
+@pytest.mark.parametrize("format", ["bvh", "glb", "fbx", "trc", "mot", "osim", "c3d"])
 def test_a_file_beside_the_motion(format, file):
     told = run("export", file, "--to", format)
     assert told.exit_code == 0, told.output
@@ -100,10 +100,13 @@ def test_unit_and_vertical_axis_are_those_asked_for(file, motion, tmp_path):
         (["--to", "trc", "--names", "mixamo"], "TRC has landmarks"),
         (["--to", "trc", "--unit", "inch"], "--unit inch is not possible for trc. Give one of: m, cm, mm."),
         (["--to", "usd", "--up", "x"], "only y and z up. --up x is not possible for usd. Give one of: y, z."),
+        (["--to", "fbx", "--names", "maya"], "Error: --names maya is not possible for fbx. Give one of: kinefit,"),
+        (["--to", "glb", "--names", "maya"], "Error: --names maya is not possible for glb. Give one of: kinefit,"),
         (["--to", "bvh", "--names", "maya"], "--names maya is not possible for bvh. Give one of: bvh, kinefit, mixamo"),
-        (["--to", "c3d", "--rest", "t"], "--rest does not apply to c3d, only to bvh, glb, usd, x3d"),
-        (["--to", "bvh", "--cylinders"], "only glb and usd contain a mesh"),
-        (["--to", "fbx"], "there are: csv, parquet, bvh, glb"),
+        (["--to", "c3d", "--rest", "t"], "--rest does not apply to c3d, only to bvh, glb, fbx, usd, x3d"),
+        (["--to", "bvh", "--cylinders"], "only fbx, glb and usd contain a mesh"),
+        (["--to", "dae"], "there are: csv, parquet, bvh, glb, fbx"),
+        (["--to", "fbx", "--up", "x"], "FBX with y or z up. --up x is not possible for fbx. Give one of: y, z."),
         ([], "--to"),
     ],
 )

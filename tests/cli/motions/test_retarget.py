@@ -5,13 +5,11 @@ import pytest
 from click.testing import CliRunner
 
 import kinefit
-from kinefit.bodies import load_body
 from kinefit.cli import main
 from kinefit.exporters import write_motion
+from kinefit.exporters.skeletons.common import NAMES
 from kinefit.motion import rotation_between_up
 from kinefit.simulation import cut, squat_and_wave
-
-NAMES = ("bvh", "kinefit", *(name for name in load_body("humanoid").aliases if name != "bvh"))
 
 
 def run(*args):

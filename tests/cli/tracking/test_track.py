@@ -131,9 +131,9 @@ def test_a_lag_knows_a_little_of_what_comes_and_stands_alone(take, tmp_path):
 
 
 def test_an_unknown_format_is_told_before_anything_is_read():
-    told = run("track", "none.toml", "--formats", "bvh,fbx")
+    told = run("track", "none.toml", "--formats", "bvh,dae")
     assert told.exit_code == 2
-    assert "no format 'fbx'; there are: motion, csv, parquet, bvh" in told.stderr
+    assert "no format 'dae'; there are: motion, csv, parquet, bvh" in told.stderr
 
 
 def cut_video(take, share):

@@ -15,11 +15,14 @@ from kinefit.motion import BRIEF_S
 RATE = 50.0
 TIMES = np.arange(101) / RATE
 MOTION = smooth_motion(101, RATE)
+MOTION = replace(MOTION, dof_std=np.full_like(MOTION.dof_std, np.radians(2.0)))
+KNEE = 6 + MOTION.body.tree.coordinate("knee_angle_l")
 
 
 def curve(std=2.0, values=None):
     values = 30 + 20 * np.sin(2 * np.pi * TIMES) if values is None else values
-    return Curve("knee_angle_l", "knee", "left", "deg", values, np.broadcast_to(std, values.shape).astype(float))
+    std = np.broadcast_to(std, values.shape).astype(float)
+    return Curve("knee_angle_l", "knee", "left", "deg", values, std, np.nan, (KNEE,), np.full((101, 1), 180 / np.pi))
 
 
 def test_of_a_sine_its_ends_range_and_speed():
@@ -69,6 +72,8 @@ def test_what_both_ends_have_in_common_is_not_in_the_range():
     brief = 1 - np.exp(-abs(motion.times[high] - motion.times[low]) / BRIEF_S)
     assert after.span[1] == pytest.approx(2 * 3 * (2 * brief) ** 0.5)
     assert "± 14" in own(ranges_table(motion))
+    tilt, common = (ranges_of(m)["pelvis_tilt"][""] for m in (motion, known))
+    assert tilt.span[0] == common.span[0] and 0 < common.span[1] < 0.8 * tilt.span[1]
     alone, less = (next(r for r in all_ranges(m) if r.name == "knee flexion").difference for m in (motion, known))
     assert alone[1] == pytest.approx(2 * 5 * 4**0.5) and less[1] < 0.7 * alone[1] and less[0] == alone[0]  # four ends
 

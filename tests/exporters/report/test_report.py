@@ -17,17 +17,19 @@ from kinefit.exporters.report.flagged import close_up, report_frames
 from kinefit.exporters.report.methods import lengths_table, methods_sentences
 from kinefit.exporters.report.moments import (
     doubtful_moments,
+    end_variances,
     never_observed,
+    probably_far,
     shared_by_prior,
     throughout_sentence,
 )
 from kinefit.exporters.report.page import band, thinned
 from kinefit.exporters.report.report import trust_sentence, write_report
-from kinefit.exporters.tables import _root_turns, curves
+from kinefit.exporters.tables import curves
 from kinefit.findings import listed, runs_of
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Residuals
+from kinefit.motion import Residuals, rotation_between_up
 from kinefit.simulation import cut, known_motion
 
 F = 80
@@ -215,28 +217,45 @@ def test_a_constant_shift_points_to_the_calibration(tmp_path):
     assert "Constant shift" not in page_of(good_motion(), tmp_path)
 
 
+def test_the_probability_of_five_centimetres_is_that_of_the_error_bars():
+    motion = smooth_motion(5)
+    motion = replace(motion, dof_std=np.full_like(motion.dof_std, 1e-6))
+    for std in ([0.03, 0.03, 0.03], [0.04, 1e-6, 1e-6], [0.02, 0.05, 0.03]):
+        found = probably_far(end_variances(replace(motion, joint_std=np.broadcast_to(std, motion.joint_std.shape))))
+        draws = np.linalg.norm(np.random.default_rng(0).normal(0.0, std, (200_000, 3)), axis=1)
+        assert found == pytest.approx(np.mean(draws > 0.05), abs=0.02)
+    knee = np.full(motion.joint_std.shape, 0.01)
+    knee[:, motion.body.tree.segment("shank_l")] = 0.1  # an end of the thigh, too
+    far = probably_far(end_variances(replace(motion, joint_std=knee))) > 0.5
+    assert (probably_far(np.zeros((2, 3, 3))) == 0.0).all()
+    names = [name for name, own in zip(motion.body.tree.segments, far.all(axis=0)) if own]
+    assert names == ["thigh_l", "shank_l"] and not far[:, motion.body.tree.segment("foot_l")].any()
+
+
 # Angles
 
 
-def test_the_root_turns_have_the_deviations_of_a_turn_about_the_worlds_axes():
-    motion = smooth_motion(6)
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_slopes_of_all_coordinates_are_their_derivatives_by_the_motions_own(up):
+    motion = smooth_motion(6, up=up)
     std = np.array([0.01, 0.02, 0.03])
     motion = replace(motion, dof_std=np.concatenate([np.zeros((6, 3)), np.tile(std, (6, 1)), motion.dof_std[:, 6:]], 1))
-    angles, found = _root_turns(motion)
-    columns = []
-    for axis in np.eye(3):
+    for k, unit in enumerate(np.eye(6)):
         both = []
         for step in (1e-6, -1e-6):
             T = motion.Ts_world_root.copy()
-            T[:, :3, :3] = se3.exp_so3(step * axis) @ T[:, :3, :3]
-            both.append(_root_turns(replace(motion, Ts_world_root=T))[0])
-        columns.append((both[0] - both[1]) / 2e-6)
-    expected = np.sqrt(np.sum((np.stack(columns, -1) * std) ** 2, axis=-1))
-    assert np.allclose(found, expected, rtol=1e-5)
-    assert angles.shape == (6, 3)
+            T[:, :3, :3] = se3.exp_so3(step * unit[3:]) @ T[:, :3, :3]
+            T[:, :3, 3] += step * unit[:3]
+            both.append(curves(replace(motion, Ts_world_root=T)))
+        for one, plus, minus in zip(curves(motion), *both):
+            slope = one.slopes[:, one.coordinates.index(k)] if k in one.coordinates else 0.0
+            assert np.allclose((plus.values - minus.values) / 2e-6, slope, atol=1e-4), one.name
+    tilt = next(c for c in curves(motion.turned("y")) if c.name == "pelvis_tilt")
+    R = rotation_between_up(up, "y")
+    assert np.allclose(tilt.std, np.sqrt(tilt.slopes**2 @ (np.abs(R) @ std) ** 2), rtol=1e-5)
     blind = np.array(motion.dof_std)
     blind[2, 4] = np.inf
-    assert np.isinf(_root_turns(replace(motion, dof_std=blind))[1][2]).all()
+    assert np.isinf(next(c for c in curves(replace(motion, dof_std=blind)) if c.name == "pelvis_tilt").std[2])
 
 
 def test_all_coordinates_are_there_in_degrees():
@@ -454,3 +473,16 @@ def test_lengths_are_in_centimetres_with_deviations_where_known():
     assert f"<td>{length:.1f}</td>" in lengths_table(motion)
     told = replace(motion, provenance={"length_std_m": {"thigh_l-shank_l": 0.012}})
     assert f"<td>{length:.1f} ± 1.2</td>" in lengths_table(told)
+
+
+def test_one_camera_is_one_sensor_and_nothing_uncertain_is_in_order(tmp_path):
+    motion = good_motion(offsets=((0.0, 0.0),))
+    seen = motion.residuals["cam0"]
+    x = np.zeros((F, len(seen.names), 3))
+    lifted = replace(seen, unit="m", values=x, measured=x + 1.0)
+    both = replace(motion, residuals={"cam0": seen, "lifted cam0": lifted})
+    page = write_report(both, tmp_path / "a.html").read_text()
+    assert "<dt>Sensors</dt><dd>1</dd>" in page and "Markers of" not in page and 'class="callout good"' in page
+    wide = replace(both, joint_std=np.full_like(motion.joint_std, 0.365))
+    page = write_report(wide, tmp_path / "b.html").read_text()
+    assert "the whole body (±" in page and 'class="callout good"' not in page

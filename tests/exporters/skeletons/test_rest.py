@@ -49,12 +49,12 @@ def test_the_bodys_own_rest_changes_nothing(motion):
     assert rest.posed(mesh, motion.body).vertices == pytest.approx(mesh.vertices)
 
 
-def test_only_mixamos_names_come_with_a_t(motion):
+def test_names_of_characters_come_with_a_t(motion):
     for names in ("kinefit", "bvh", "cmu", "opensim", "hanim"):
         assert np.array_equal(rest_pose(motion.body, None, names, "").turns, np.tile(np.eye(3), (20, 1, 1)))
-    assert np.array_equal(
-        rest_pose(motion.body, None, "mixamo", "").turns, rest_pose(motion.body, "t", "kinefit", "").turns
-    )
+    t = rest_pose(motion.body, "t", "kinefit", "").turns
+    for names in ("mixamo", "vrm", "unity", "Unreal"):
+        assert np.array_equal(rest_pose(motion.body, None, names, "").turns, t)
 
 
 def test_a_person_who_stands_in_the_rest_pose_has_no_rotation_in_the_file(motion):

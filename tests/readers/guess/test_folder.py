@@ -491,7 +491,8 @@ def test_markers_alone(folder):
     (folder / "bad.c3d").write_bytes(b"\x02\x50")
     take, _, guess = taken(folder)
     assert [entry.file.name for entry in take.markers] == ["walk.trc"] and (take.up, take.rate) == ("y", 100.0)
-    assert "bad.c3d not used" in notes(guess) and '# file = "static.trc"' in guess.text
+    assert "bad.c3d not used" in notes(guess) and take.markers[0].static.name == "static.trc"
+    assert "needs cameras" not in notes(guess) and "static.trc: the static trial" in notes(guess)
     (folder / "walk.trc").unlink()
     (folder / "static.trc").unlink()
     with pytest.raises(TakeError, match="no marker file can be read"):
@@ -665,16 +666,50 @@ def test_depth_of_a_folder_and_of_a_track(folder):
 
 @pytest.mark.parametrize(("name", "said"), [
     (".IMG_0001.MOV.icloud", "iCloud"), ("session.zip", "an archive"), ("VID.insv", "360°"),
-    ("v.mp4.crdownload", "not finished"), ("one.png", "one depth image"),
+    ("v.mp4.crdownload", "not finished"), ("me.jpg", "12 numbered images"),
 ])  # fmt: skip
 def test_what_stands_in_place_of_a_recording_is_named(folder, name, said):
     (folder / name).write_bytes(b"x")
-    if name == "one.png":
-        cv2.imwrite(str(folder / name), np.tile(np.linspace(2000, 3000, 64), (48, 1)).astype(np.uint16))
     with pytest.raises(TakeError, match=rf"no videos.*{re.escape(name)}.*{said}"):
         guess_take(folder)
     write_video(folder / "phone.mp4", frames=5)
-    assert said in notes(guess_take(folder))
+    assert name == "me.jpg" or said in notes(guess_take(folder))
+
+
+def test_one_depth_image_is_a_take_of_one_pose(folder):
+    cv2.imwrite(str(folder / "one.png"), np.tile(np.linspace(2000, 3000, 64), (48, 1)).astype(np.uint16))
+    guess = guess_take(folder)
+    assert "one.png: one depth image" in notes(guess) and 'file = "one.png"' in guess.text
+    write_video(folder / "phone.mp4", frames=5)
+    beside = guess_take(folder)
+    assert "one depth image" in notes(beside) and "[[depth]]" not in beside.text
+
+
+@pytest.mark.parametrize(("name", "size", "focal", "sure"), [
+    ("D435i session", (848, 480), 425.0, "likely"), ("kinect_v2", (512, 424), 365.0, "likely"),
+    ("Kinect", (640, 480), 577.0, "likely"), ("femto bolt", (640, 576), 504.0, "likely"),
+    ("depth", (512, 424), 365.0, "guess"), ("depth", (640, 480), None, "open"), ("depth", (200, 100), None, "open"),
+])  # fmt: skip
+def test_the_lens_of_a_depth_camera_is_guessed_by_name_and_size(folder, name, size, focal, sure):
+    (folder / name).mkdir()
+    for i in range(2):
+        row = np.linspace(2000, 3000, size[0])
+        cv2.imwrite(str(folder / name / f"{i}.png"), np.tile(row, (size[1], 1)).astype(np.uint16))
+    guess = guess_take(folder)
+    assert f"{sure} intrinsics" in notes(guess) and "rate = 30.0" in guess.text
+    if focal is None:
+        assert "# intrinsics =" in guess.text and ("first Kinect" in notes(guess)) == (size == (640, 480))
+        return
+    (folder / "take.toml").write_text(guess.text)
+    seen = load_observations(read_take(folder / "take.toml"))
+    assert seen.depth[0].camera.matrix[0, 0] == focal and seen.depth[0].camera.matrix[1, 2] == (size[1] - 1) / 2
+
+
+def test_images_without_motion_and_of_all_directions_are_named(folder):
+    write_video(folder / "a.mp4", frames=1)
+    assert "a.mp4: one frame" in notes(guess_take(folder)) and "360" not in notes(guess_take(folder))
+    write_video(folder / "a.mp4", frames=3, size=(640, 320))
+    assert "360° videos" in notes(guess_take(folder)) and "18:9" in notes(guess_take(folder))
 
 
 def test_masks_of_16_bits_are_no_depth(folder):
@@ -682,7 +717,7 @@ def test_masks_of_16_bits_are_no_depth(folder):
         mask = np.zeros((48, 64), np.uint16)
         mask[10:20] = 65535
         cv2.imwrite(str(folder / f"mask_{i}.png"), mask)
-    with pytest.raises(TakeError, match="no videos.* among 3 files\\."):
+    with pytest.raises(TakeError, match="no videos.* among 3 files: 3 images"):
         guess_take(folder)
 
 

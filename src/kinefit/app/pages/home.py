@@ -10,13 +10,16 @@ from nicegui import ui
 
 from kinefit._files import writing
 from kinefit.app.desk import Desk
-from kinefit.app.folders import SessionRow, recordings, subfolders, takes_below, video_files
+from kinefit.app.folders import SessionRow, openable_files, recordings, subfolders, takes_below
 from kinefit.app.jobs import DONE, RUNNING
-from kinefit.app.pages.shell import card, in_thread, link, loaded, page_frame, shell, short, show_error, texts
+from kinefit.app.pages.result import text_table
+from kinefit.app.pages.shell import card, in_thread, link, loaded, notified, page_frame, shell, short, show_error, texts
 from kinefit.app.pages.take import use_folder
 from kinefit.app.review import Comparison
 from kinefit.app.texts import Texts
+from kinefit.assets import write_sample_take
 from kinefit.errors import KinefitError, printable
+from kinefit.exporters.tables import spoken
 from kinefit.rendering import looks
 
 _MAX_UPLOAD_BYTES = 2**30  # of a dropped video; larger ones are opened where they are
@@ -38,6 +41,7 @@ async def home_page(desk: Desk) -> None:
                 _drop_area(desk, t)
         with card(t("home.session_title", folder=desk.root)):
             await _takes(desk, t)
+            ui.button(t("home.demo"), icon="directions_run", on_click=lambda: _demo(desk)).props("flat no-caps")
 
 
 def _ask_faces(desk: Desk, t: Texts) -> None:
@@ -50,6 +54,15 @@ def _ask_faces(desk: Desk, t: Texts) -> None:
         with ui.row():
             ui.button(t("home.hide"), icon="visibility_off", on_click=lambda: choose(True))
             ui.button(t("home.show"), icon="visibility", on_click=lambda: choose(False)).props("outline")
+
+
+async def _demo(desk: Desk) -> None:
+    """Open the sample recording; it is written below the session's folder, unless it is there, with its corrections."""
+    take = desk.root / "demo" / "take.toml"
+    with notified():
+        if not take.is_file():
+            await in_thread(write_sample_take, take.parent)
+        ui.navigate.to(link("/take", path=take))
 
 
 class _FolderChoice:
@@ -69,15 +82,15 @@ class _FolderChoice:
         except KinefitError as error:
             show_error(t, error)
             inside = []
-        videos = video_files(self._at)
+        files = openable_files(self._at)
         with ui.scroll_area().classes("w-full h-48 border"), ui.list().props("dense").classes("w-full"):
             if self._at.parent != self._at:  # two elements an entry: hundreds of folders are listed in a moment
                 ui.item(f"↑ {t('home.up')}", on_click=lambda: self._go(self._at.parent))
             for folder in inside:
                 ui.item(printable(folder.name), on_click=lambda folder=folder: self._go(folder))
-        more = " ..." if len(videos) > _MAX_NAMES else ""
-        names = printable(", ".join(video.name for video in videos[:_MAX_NAMES]) + more)
-        ui.label(t("home.videos_here", count=len(videos), names=names) if videos else t("home.no_videos"))
+        more = " ..." if len(files) > _MAX_NAMES else ""
+        names = printable(", ".join(file.name for file in files[:_MAX_NAMES]) + more)
+        ui.label(t("home.files_here", count=len(files), names=names) if files else t("home.no_files"))
         ui.button(t("home.use"), icon="folder_open", on_click=self._open)
 
     def _go(self, folder: Path) -> None:
@@ -251,22 +264,15 @@ def _angles(t: Texts, both: Comparison, names: tuple[str, str]) -> None:
         })  # fmt: skip
         chart.update()
 
-    angles = list(both.angles)
-    first = next((name for name in angles if name.startswith("knee_angle")), angles[0])
-    choice = ui.select(angles, value=first, label=t("compare.angle"), on_change=draw).classes("w-48")
+    angles = {name: spoken(name) for name in both.angles}
+    first = next((name for name in angles if name.startswith("knee_angle")), next(iter(angles)))
+    choice = ui.select(angles, value=first, label=t("compare.angle"), on_change=draw).classes("w-64")
     chart = ui.echart({}).classes("w-full h-[22rem]")
     draw()
 
 
 def _ranges(t: Texts, both: Comparison) -> None:
     ui.label(t("compare.ranges_text")).classes("text-sm")
-    keys = ("angle", "range_before", "range_after", "change")
-    columns = [
-        {"name": key, "label": t(f"compare.{key}"), "field": key, "align": "left" if key == "angle" else "right"}
-        for key in keys
-    ]
-    rows = []
-    for of in both.ranges:
-        values = (text.replace(" ", "\u00a0") for text in (of.before, of.after, "● " * of.is_clear + of.change))
-        rows.append(dict(zip(keys, (of.angle, *values), strict=True)))
-    ui.table(columns=columns, rows=rows, row_key="angle").classes("w-full").props("dense wrap-cells")
+    columns = [t(f"compare.{key}") for key in ("angle", "range_before", "range_after", "change")]
+    rows = ((of.angle, of.before, of.after, "● " * of.is_clear + of.change) for of in both.ranges)
+    text_table(columns, rows)

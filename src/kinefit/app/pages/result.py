@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -31,11 +31,13 @@ from kinefit.batch.results import FORMATS, description, write_format
 from kinefit.batch.viewed import is_outdated
 from kinefit.errors import KinefitError
 from kinefit.exporters.report.moments import Moment, doubtful_moments
+from kinefit.exporters.tables import spoken
+from kinefit.initialization.from_clicks import clickable
 from kinefit.rendering.looks import to_hex
 
 _REFRESH_S = 0.1  # between two looks at the clock of the 3D figure
 _IMAGE_PX = 720  # longer side of a camera's image
-_IMAGES_REM = 25.0  # side of a square with as much area as all images have together
+_IMAGE_REM, _IMAGES_A_ROW = 24.0, 4  # largest height of an image, and number of them side by side
 _MAX_POINTS = 2000  # of a curve
 
 
@@ -63,19 +65,34 @@ class _ResultPage:
         motion = review.motion
         if not review.has_cameras:
             ui.label(t("result.other_cameras")).props('role="alert"')
+        self._time_line()
         with ui.row().classes("w-full items-stretch"):
-            page_frame(review.scene.address, "3D").classes("flex-1 min-w-[320px] min-h-[28rem] border")
-            with ui.row().classes("flex-1 min-w-[320px] content-start gap-1"):
+            page_frame(review.scene.address, "3D").classes("flex-1 min-w-[320px] min-h-[26rem] border")
+            wide = "flex-1 min-w-[320px]" if len(review.cameras) < 2 else "w-full"
+            with ui.row().classes(f"{wide} content-start gap-1"):
                 for camera in review.cameras:
                     image = ui.interactive_image(on_mouse=lambda event, camera=camera: self._click(camera, event))
                     image.props["alt"] = camera
                     self._images[camera] = image
                     self._enlarge(camera, False)
-        self._time_line()
+                if review.cameras:
+                    with ui.row().classes("items-center w-full"):
+                        ui.label(t("result.drag")).classes("text-sm")
+                        joints = list(dict.fromkeys((*clickable(motion.body), *motion.body.landmarks.names)))
+                        self._joint = ui.select(joints, label=t("result.joint"), with_input=True, clearable=True)
+                        self._joint.classes("w-48")
+        with card(t("result.ranges")):
+            ui.label(t("result.ranges_text")).classes("text-sm")
+            columns = ("range_of", "left", "right", "middle", "difference")
+            text_table([t(f"result.{key}") for key in columns], review.ranges)
+            if (report := review.folder / "report.html").is_file():
+                desk.files.folders.add(review.folder)
+                ui.link(t("take.report"), link("/file", path=report), new_tab=True)
         with card(t("result.angle")):
-            names = motion.body.tree.coordinates
-            first = next((name for name in names if name.startswith("knee_angle")), names[0])
-            self._angle = ui.select(list(names), value=first, on_change=lambda: self._draw_angle())
+            names = {name: spoken(name) for name in motion.body.tree.coordinates}
+            first = next((name for name in names if name.startswith("knee_angle")), next(iter(names)))
+            self._angle = ui.select(names, value=first, with_input=True, on_change=lambda: self._draw_angle())
+            self._angle.classes("w-64")
             self._chart = ui.echart({}, on_point_click=lambda event: self._go(event.data_index * self._step))
             self._chart.classes("w-full h-56")
             self._draw_angle()
@@ -89,8 +106,9 @@ class _ResultPage:
     def _enlarge(self, camera: str, large: bool) -> None:
         """Show a camera's image as wide as there is room, or as small as all of them fit."""
         width, height = self._review.size(camera)
-        side = _IMAGES_REM * (width / height / len(self._review.cameras)) ** 0.5
-        self._images[camera].style(f"width: {'100%' if large else f'min(100%, {side:.1f}rem)'}")
+        share = 100.0 / min(len(self._review.cameras), _IMAGES_A_ROW)
+        small = f"min({share:.4g}% - 0.25rem, {_IMAGE_REM * width / height:.1f}rem)"
+        self._images[camera].style(f"width: {'100%' if large else small}")
         self._large = camera if large else None
 
     def _time_line(self) -> None:
@@ -174,7 +192,7 @@ class _ResultPage:
             "xAxis": {"type": "category", "data": [round(float(s), 3) for s in motion.times[::step]], "name": "s"},
             "yAxis": {"type": "value", "scale": True, "name": self._t("result.angles_unit")},
             "series": [
-                {**line, "name": name, "data": _numbers(value), "markLine": _mark(0)},
+                {**line, "name": spoken(name), "data": _numbers(value), "markLine": _mark(0)},
                 {**band, "data": _numbers(value - spread)},
                 {**band, "data": _numbers(2 * spread), "areaStyle": {"opacity": 0.15}},
             ],
@@ -200,10 +218,6 @@ class _ResultPage:
             if cameras:
                 which = ui.select(cameras, value=cameras[0], label=t("result.which")).classes("w-32")
                 self._camera_buttons(which)
-        with ui.row().classes("items-center"):
-            ui.label(t("result.drag"))
-            names = list(self._review.motion.body.landmarks.names)
-            self._joint = ui.select(names, label=t("result.joint"), with_input=True, clearable=True).classes("w-48")
         self._list()
 
     def _camera_buttons(self, which: ui.select) -> None:
@@ -299,6 +313,14 @@ class _ResultPage:
             for format in FORMATS.names():
                 button = ui.button(format, on_click=lambda format=format: write(format)).props("outline no-caps")
                 button.tooltip(description(format))
+
+
+def text_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """A table of texts, whose first column has the names of its rows."""
+    heads = [{"name": str(k), "label": head, "field": str(k), "align": "right" if k else "left"}
+             for k, head in enumerate(columns)]  # fmt: skip
+    cells = [{str(k): text.replace(" ", "\u00a0") if k else text for k, text in enumerate(row)} for row in rows]
+    ui.table(columns=heads, rows=cells, row_key="0").classes("w-full").props("dense wrap-cells")
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:

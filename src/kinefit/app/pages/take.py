@@ -237,7 +237,7 @@ class _TakePage:
     def _person(self) -> None:
         t = self._t
         with ui.row().classes("items-end"):
-            height = ui.number(t("take.height"), value=self._take.height, min=0.3, max=3, step=0.01, format="%.2f")
+            height = ui.input(t("take.height"), value=f"{self._take.height or ''}", placeholder="1.75, 175 cm")
             height.classes("w-64").tooltip(t("take.height_text")).on("blur", lambda: self._set_height(height.value))
             who = {"": t("take.everybody"), "first": t("take.first"), "moving": t("take.moving")}
             who |= {"largest": t("take.largest")}
@@ -248,9 +248,9 @@ class _TakePage:
             self._quality = ui.select(qualities, label=t("take.quality"), value="best").classes("w-40")
         people_cards(self._desk, t, self._folder.file, self._who)
 
-    def _set_height(self, height: float | None) -> None:
-        if (height or None) != self._take.height:
-            self._edit(lambda: corrections.set_height(self._folder.file, height or None), self._t("take.height_saved"))
+    def _set_height(self, height: str) -> None:
+        if height.strip() != f"{self._take.height or ''}":
+            self._edit(lambda: corrections.set_height(self._folder.file, height.strip()), self._t("take.height_saved"))
 
     def _choose(self, who: str) -> None:
         """Write who is meant into the take file; a number that was chosen by an image stays."""

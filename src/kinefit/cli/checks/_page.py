@@ -47,6 +47,8 @@ def check_page(check: Checked, refinement: Refined | None = None) -> str:
 
 def verdict(check: Checked) -> str:
     """One sentence: how many faults and doubts there are."""
+    if check.observations is None and all(found.severity == "note" for found in check.findings):
+        return "Nothing could be checked."
     count = {s: sum(found.severity == s for found in check.findings) for s in ("fault", "doubt", "note")}
     counts = [f"{n} {s}{'s' if n > 1 else ''}" for s, n in count.items() if n]
     if count["fault"]:

@@ -26,14 +26,14 @@ _PRINTED = ("camera", "bias u, v [px]", "±", "spread", "late [frames]", "left/r
 
 
 @click.command(short_help="Find faults of a recording; refine its calibration.", epilog=_EXAMPLES)
-@click.argument("take", type=click.Path(path_type=Path))
-@click.option("-o", "--out", type=click.Path(path_type=Path), help="HTML page to write.  [default: TAKE-check.html]")
+@click.argument("take", type=_screen.PATH)
+@click.option("-o", "--out", type=_screen.PATH, help="HTML page to write.  [default: TAKE-check.html]")
 @click.option("--refine", is_flag=True, help="Write a refined calibration and a take that uses it, as new files.")
 @click.option("--focal", is_flag=True, help="With --refine: refine focal lengths too.")
 @click.option("--distortion", is_flag=True, help="With --refine: refine lens distortion too.")
 @click.option("--time-offsets", is_flag=True, help="With --refine: refine time offsets too.")
 @click.option(
-    "--points", type=click.Path(path_type=Path),
+    "--points", type=_screen.PATH,
     help="With --refine: TOML file of static points: [NAME], then CAMERA = [u, v] px in the calibration's image.",
 )
 @click.option("--fix", is_flag=True, help="Write what corrects faults into the take, then check again.")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kinefit.batch.results import FORMATS, check_formats, write_results
+from kinefit.batch.results import FORMATS, check_formats, description, write_results
 from kinefit.bodies import Body, PointSet, load_body
 from kinefit.bodies.marker_sets import bare, find_marker_set, load_marker_set, matched, read_sides
 from kinefit.cli import _screen
@@ -200,7 +200,7 @@ def check_labels(markers: Markers, marker_set: str | None) -> list[Finding]:
     return found
 
 
-WRITTEN = ("motion", "mot", "osim", "trc", "bvh", "glb", "markers")
+WRITTEN = ("motion", "csv", "bvh", "glb", "trc", "mot", "osim", "markers", "report")
 """Formats that are written where none are named."""
 
 _MARKERS = "markers.trc"  # what was measured, in OpenSim's world: with body.osim and its marker set, IK runs there too
@@ -245,7 +245,7 @@ def fit_file(
     path : C3D or TRC file with labels; several people bear their names as prefixes ("Anna:LASI").
     out : folder, default beside the file: NAME-kinefit; with several people one folder for each in it.
     unit : str, optional, of files that state none or a wrong one.
-    formats : names of `FORMATS`, and "markers" for the measured ones as OpenSim takes them.
+    formats : names of `FORMATS`, "markers" for the measured ones as OpenSim takes them, and "report".
     step : (what, done, total) -> None, called as the fit advances.
     notes : filled with what is to be said about labels, once for each person.
 
@@ -261,19 +261,24 @@ def fit_file(
     """
     from kinefit.diagnostics.quick import motion_findings
     from kinefit.exporters import write_markers, write_osim, write_trc
+    from kinefit.exporters.report.report import write_report
     from kinefit.markers.sides import label_findings, refuse_wrong_sides
     from kinefit.markers.subject import fit_marker_subject
     from kinefit.tracking.markers import fit_markers
 
     step, formats, options = step or (lambda what, done, total: None), tuple(formats), options or MarkerFitOptions()
     folder = out if out is not None else path.with_name(f"{path.stem}-kinefit")
-    check_formats(name for name in formats if name != "markers")
+    check_formats(name for name in formats if name not in ("markers", "report"))
     _screen.check_folder(folder)
     generic = load_body(options.body)
     people = read_people(path, unit, options.sides)
     trials = read_people(options.static, unit, options.sides) if options.static else {}
     found: dict[str, tuple[Motion, dict[str, Path]]] = {}
-    for person, markers in people.items():
+    for person, whole in people.items():
+        markers = whole.trimmed()
+        left_out = markers.notes[len(whole.notes) :]
+        for text in left_out:
+            note(f"{text}.")
         trial = trials.get(person) or (next(iter(trials.values())) if len(trials) == 1 == len(people) else None)
         found_labels: tuple[Finding, ...] = ()
         for file, trial_markers in ((options.static, trial), (path, markers)):
@@ -295,7 +300,7 @@ def fit_file(
         files: dict[str, Path] = {}
         own = folder / person if len(people) > 1 else folder
         worn = worn_body(subject, markers.names)
-        plain = [name for name in formats if name not in ("markers", "osim", "trc")]
+        plain = [name for name in formats if name not in ("markers", "osim", "report", "trc")]
         write_results(motion, own, plain, step, files)
         if "trc" in formats:
             write_trc(motion, own / FORMATS.get("trc").file, worn.landmarks)  # the points of body.osim
@@ -309,6 +314,10 @@ def fit_file(
             seen = replace(markers, names=names, positions=x, up="y")
             write_markers(seen, own / _MARKERS, unit="m")
             files["markers"] = own / _MARKERS
+        if "report" in formats:
+            links = {file.relative_to(own).as_posix(): description(name) for name, file in files.items()}
+            trimmed = [("warning", f"{text}.", "") for text in left_out]
+            files["report"] = write_report(motion, own / "report.html", files=links, findings=trimmed)
         found[person] = motion, files
     return found
 

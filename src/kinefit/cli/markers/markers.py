@@ -175,14 +175,15 @@ Examples:
 @click.option("--static", type=_screen.PATH, help="Labelled static trial of the same subject.")
 @click.option("--body", default="humanoid", show_default=True, help="Body of the catalogue, or a body file.")
 @click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the set that has the labels]")
-@click.option("--height", type=click.FloatRange(0.5, 2.6), metavar="M", help="Height of the subject, barefoot [m].")
+@click.option("--height", type=_screen.HEIGHT, metavar="M", help="Height of the subject, barefoot [m].")
 @click.option("--up", type=click.Choice(["x", "y", "z"]), help="Vertical axis.  [default: estimated]")
 @click.option("--sides", type=click.Choice(["labelled", "exchanged", "mirrored-x", "mirrored-y", "mirrored-z"]),
               help="How left and right are read: exchanged labels, a world with one axis negated, or as labelled "
               "without a check.  [default: as labelled, checked]")
 @click.option("--limits/--no-limits", default=True, show_default=True, help="Keep joint angles within their limits.")
 @click.option("--smooth/--no-smooth", default=True, show_default=True, help="Fit all frames together, or each alone.")
-@click.option("--formats", metavar="LIST", help="Formats to write.  [default: motion,mot,osim,trc,bvh,glb,markers]")
+@click.option("--formats", metavar="LIST",
+              help="Formats to write.  [default: motion,csv,bvh,glb,trc,mot,osim,markers,report]")  # fmt: skip
 @_unit
 @_screen.verbose_option
 def fit(
@@ -191,7 +192,7 @@ def fit(
     unit: str | None,
 ) -> None:  # fmt: skip
     """Fit a body to markers: size and marker offsets from all frames, then joint angles."""
-    from kinefit.cli._summary import print_summary
+    from kinefit.cli._summary import print_files, print_summary
     from kinefit.cli.markers._fit import WRITTEN, MarkerFitOptions, fit_file, identify_file
 
     out = out or take.with_name(f"{take.stem}-kinefit")
@@ -213,10 +214,8 @@ def fit(
         _screen.tell_finding(note)
     for motion, _ in found.values():
         print_summary(motion, points=_screen.is_verbose())
-    _screen.say("\nWritten:")
-    written = [files] if subjects else []
-    for path in (path for group in (*written, *(w for _, w in found.values())) for path in group.values()):
-        _screen.say(f"  {path}")
+    for written in (*([files] if subjects else []), *(w for _, w in found.values())):
+        print_files(written)
 
 
 @markers.command(epilog="""\b

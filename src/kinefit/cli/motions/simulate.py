@@ -32,15 +32,15 @@ def _choices(format: str) -> str:
 _EXAMPLES = """\b
 Examples:
   kinefit export take-kinefit/motion.npz --to bvh --unit m            upright and of the right size in Blender
-  kinefit export motion.npz --to glb --names mixamo                   retargets by name in Blender, Unity, Unreal
+  kinefit export motion.npz --to fbx --names unreal                   for Unreal, with the bones of its mannequin
   kinefit export motion.npz --to usd --up z --out walk.usda
   kinefit export motion.npz --to trc --out walk.trc --unit mm
   kinefit export motion.npz --to parquet --out tables
   kinefit export motion.npz --retarget character.glb                  the motion on another character's mesh
 
 \b
-Values of each format, default first (csv, parquet, c3d, nwb, rrd, jsonl keep the vertical axis; --names mixamo has
-rest pose t):
+Values of each format, default first (csv, parquet, c3d, nwb, rrd, jsonl keep the vertical axis; --names mixamo, vrm,
+unity and unreal have rest pose t):
 """ + "".join(f"  {format:<8} {_choices(format)}\n" for format in NAMES)
 
 
@@ -71,9 +71,9 @@ def _format(ctx: click.Context, parameter: click.Parameter, value: str | None) -
 @click.option("-o", "--out", type=_screen.PATH, help="File or folder.  [default: next to MOTION]")
 @click.option("--unit", metavar="UNIT", help="Unit of length: m, cm or mm.")
 @click.option("--up", metavar="AXIS", help="Vertical axis: x, y, z, -x, -y or -z.")
-@click.option("--names", metavar="NAMES", help="Names of joints: kinefit, mixamo, cmu, opensim, hanim or bvh.")
+@click.option("--names", metavar="NAMES", help=f"Names of joints: {', '.join(FORMATS.get('glb').names)}.")
 @click.option("--rest", metavar="POSE", help="Rest pose: body (arms hanging, facing x) or t (a T facing z).")
-@click.option("--cylinders", is_flag=True, help="GLB and USD: write the body's cylinders instead of a skin.")
+@click.option("--cylinders", is_flag=True, help="FBX, GLB and USD: write the body's cylinders instead of a skin.")
 @_screen.verbose_option
 def export(
     motion: Path, format: str | None, character: Path | None, table: Path | None, out: Path | None, cylinders: bool,
@@ -89,8 +89,8 @@ def export(
     if format is None:
         problem = f"Missing option '--to' (or --retarget CHARACTER). Give --to [{'|'.join(NAMES)}]."
         raise click.UsageError(problem)
-    if cylinders and format not in ("glb", "usd"):
-        raise click.UsageError(f"--cylinders does not apply to {format}: only glb and usd contain a mesh of the body.")
+    if cylinders and format not in ("fbx", "glb", "usd"):
+        raise click.UsageError(f"--cylinders does not apply to {format}: only fbx, glb and usd contain a mesh.")
     chosen = FORMATS.get(format)
     options = {
         key: _choice(format, key, _meant(key, value, getattr(chosen, key)))
@@ -144,7 +144,7 @@ def _choice(format: str, key: str, value: str) -> str:
     valid = getattr(chosen, key)
     if value in valid:
         return value
-    why = f"{chosen.why}. " if chosen.why and not (valid and key == "unit") else ""
+    why = f"{chosen.why}. " if chosen.why and (not valid or (key == "up" and "x" not in valid)) else ""
     if valid:
         raise click.UsageError(f"{why}--{key} {value} is not possible for {format}. Give one of: {', '.join(valid)}.")
     others = [name for name in FORMATS.built_in if getattr(FORMATS.get(name), key)]

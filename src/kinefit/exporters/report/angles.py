@@ -171,7 +171,7 @@ class Extremes:
         interval of its own: that of noise alone is above zero, too.
     share : of the frames in which the coordinate was observed.
     ends : frames of the lowest and the highest value
-    coordinate : its number in `Motion.dof_std`, None for a mixture of several
+    terms : frames, coordinates and weights of the span in `Motion.std_of`
     """
 
     lowest: tuple[float, float]
@@ -180,7 +180,7 @@ class Extremes:
     fastest: tuple[float, float]
     share: float
     ends: tuple[int, int]
-    coordinate: int | None
+    terms: tuple[NDArray, NDArray, NDArray]
 
 
 def extremes(curve: Curve, motion: Motion, tracked: NDArray) -> Extremes | None:
@@ -199,13 +199,11 @@ def extremes(curve: Curve, motion: Motion, tracked: NDArray) -> Extremes | None:
     inside[[0, -1]] = False
     fastest = float(speed[inside].max()) if inside.any() else np.nan
     ends = [(float(curve.values[f]), float(2 * curve.std[f])) for f in (low, high)]
-    share = float(known.mean())
-    if curve.coordinate is None:
-        twice = float(np.hypot(ends[0][1], ends[1][1]))
-    else:
-        twice = 2.0 * float(np.degrees(motion.std_of((high, low), (curve.coordinate,) * 2, (1, -1))))
-    fast = fastest, 2.0 * curve.speed_std
-    return Extremes(ends[0], ends[1], (span, twice), fast, share, (low, high), curve.coordinate)
+    count = len(curve.coordinates)
+    weights = np.concatenate([curve.slopes[high], -curve.slopes[low]])
+    terms = np.repeat([high, low], count), np.tile(curve.coordinates, 2), weights
+    fast, share = (fastest, 2.0 * curve.speed_std), float(known.mean())
+    return Extremes(ends[0], ends[1], (span, 2.0 * motion.std_of(*terms)), fast, share, (low, high), terms)
 
 
 def ranges_of(motion: Motion) -> dict[str, dict[str, Extremes | None]]:
@@ -216,7 +214,7 @@ def ranges_of(motion: Motion) -> dict[str, dict[str, Extremes | None]]:
     tree, believed = motion.body.tree, (motion.quality > 0)[:, None] & ~motion.lost
 
     def tracked(curve: Curve) -> NDArray:
-        segment = 0 if curve.coordinate is None else int(tree.owners[curve.coordinate - 6])
+        segment = int(tree.owners[curve.coordinates[0] - 6]) if curve.coordinates[0] >= 6 else 0
         return np.asarray(believed[:, segment] & believed[:, max(int(tree.parents[segment]), 0)])
 
     out: dict[str, dict[str, Extremes | None]] = {}
@@ -271,18 +269,18 @@ def range_changes(before: Motion, after: Motion) -> dict[tuple[str, str], RangeC
         b = later.get(stem, {}).get(side)
         change = None
         if a and b:
-            alike = 4.0 * np.degrees(np.degrees(_covariance(shared, before, a, after, b)))
+            alike = 4.0 * _covariance(shared, before, a, after, b)
             change = b.span[0] - a.span[0], float(np.sqrt(max(a.span[1] ** 2 + b.span[1] ** 2 - 2.0 * alike, 0.0)))
         out[stem, side] = RangeChange(a, b, change)
     return out
 
 
 def _covariance(shared: NDArray | None, before: Motion, a: Extremes, after: Motion, b: Extremes) -> float:
-    """[rad²] of the ranges of one angle in two takes."""
-    if shared is None or a.coordinate is None or b.coordinate is None:
+    """[deg²] of the ranges of one angle in two takes."""
+    if shared is None:
         return 0.0
     first, second = (
-        np.subtract(*motion.lasting.at(one.ends[::-1], np.array([one.coordinate] * 2))[0])  # type: ignore[union-attr]
+        one.terms[2] @ motion.lasting.at(*one.terms[:2])[0]  # type: ignore[union-attr]
         for motion, one in ((before, a), (after, b))
     )
     return float(first @ shared @ second)
@@ -337,6 +335,12 @@ class AngleRange:
         """Whether the angle moved by more than the error bar on any side."""
         return any(span > twice for span, twice in self.sides.values())
 
+    @property
+    def row(self) -> tuple[str, ...]:
+        """Its name, and the ranges of left, right and middle and left minus right in words, "" where there is none."""
+        each = (*map(self.sides.get, ("left", "right", "")), self.difference)
+        return self.name[0].upper() + self.name[1:], *(with_error(*pair) if pair else "" for pair in each)
+
 
 def all_ranges(motion: Motion) -> list[AngleRange]:
     """Ranges of all angles that were observed."""
@@ -350,22 +354,17 @@ def all_ranges(motion: Motion) -> list[AngleRange]:
 
 def short_table(found: Sequence[AngleRange]) -> p.Html:
     """Ranges, left beside right, and their difference."""
-    cells = [
-        [with_error(*pair) if pair else "" for pair in (*map(one.sides.get, ("left", "right", "")), one.difference)]
-        for one in found
-    ]
-    names = [one.name[0].upper() + one.name[1:] for one in found]
     columns = ["range of motion [°]", "left", "right", "middle", "left minus right"]
-    return p.table(columns, [(name, *row) for name, row in zip(names, cells)])
+    return p.table(columns, [one.row for one in found])
 
 
 def _difference(motion: Motion, left: Extremes | None, right: Extremes | None) -> tuple[float, float] | None:
     """AngleRange of the left side minus that of the right, with two standard deviations [deg]."""
-    if left is None or right is None or left.coordinate is None or right.coordinate is None:
+    if left is None or right is None:
         return None
-    frames, coordinates = zip(*((f, side.coordinate) for side in (left, right) for f in side.ends[::-1]))
-    std = motion.std_of(frames, coordinates, (1, -1, -1, 1))
-    return left.span[0] - right.span[0], 2.0 * float(np.degrees(std))
+    frames, coordinates, weights = map(np.concatenate, zip(left.terms, right.terms))
+    weights[len(left.terms[2]) :] *= -1.0
+    return left.span[0] - right.span[0], 2.0 * motion.std_of(frames, coordinates, weights)
 
 
 def with_error(value: float, twice: float) -> str:

@@ -9,7 +9,13 @@ from numpy.typing import NDArray
 
 from kinefit.exporters.pictures.drawing import draw_body, draw_residuals, drawn_points
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.moments import Moment, doubtful_moments, place, span, spoken_segments
+from kinefit.exporters.report.moments import (
+    Moment,
+    doubtful_moments,
+    place,
+    span,
+    spoken_segments,
+)
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
 
@@ -23,13 +29,17 @@ _MAX_TABLE_MOMENTS = 200
 _WARNING, _BAD = "#e0a100", "#d0441c"
 
 
-def flagged(motion: Motion, moments: Sequence[Moment], pictures: Pictures, width: int) -> list[p.Html]:
-    """Parts of the section on doubtful moments; pictures at most `width` px wide."""
+def flagged(
+    motion: Motion, moments: Sequence[Moment], throughout: str, pictures: Pictures, width: int
+) -> list[p.Html]:
+    """Parts of the section on doubtful moments, with `throughout_sentence`; pictures at most `width` px wide."""
     if not motion.residuals and not moments:
         return [p.callout("note", "This motion has no measurements, so doubtful moments are not known.")]
     if not moments:
-        text = "None: no end of a segment is probably more than 8 cm off, except where it is so in most frames."
-        return [p.callout("good", text)]
+        text = "None: no end of a segment is probably more than 5 cm off"
+        if throughout:
+            return [p.callout("note", f"{text} for a moment only. In most frames these are: {throughout}.")]
+        return [p.callout("good", f"{text}.")]
     out = [time_line(motion, moments)]
     for m in moments[:MOMENTS]:
         shots = [

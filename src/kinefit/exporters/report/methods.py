@@ -17,6 +17,7 @@ from kinefit.findings import listed
 from kinefit.motion import SHOWN_UNITS, Motion
 from kinefit.readers.plugins import KEYPOINTS
 
+_LIFTED = "lifted "  # before a camera's name: its own landmarks in 3D, by a network, and no other sensor
 _BUILT_IN_DETECTOR = "MediaPipe's pose networks as kinefit runs them (Bazarevsky et al. 2020, BlazePose)"
 
 
@@ -25,7 +26,7 @@ def methods(motion: Motion, date: str, doubtful: int) -> list[p.Html]:
     text = " ".join(methods_sentences(motion, doubtful))
     facts = {
         "Body": f"{motion.body.name}, {len(motion.body.tree.coordinates)} angles",
-        "Sensors": f"{len(motion.residuals)}",
+        "Sensors": f"{len([name for name in motion.residuals if not name.startswith(_LIFTED)])}",
         "Quality, mean (0–1)": f"{motion.quality.mean():.2f}", "Quality, lowest": f"{motion.quality.min():.2f}",
     }  # fmt: skip
     return [
@@ -43,7 +44,7 @@ def methods_sentences(motion: Motion, doubtful: int) -> list[str]:
     """The sentences of the methods paragraph."""
     provenance, body = motion.provenance, motion.body
     pixels = [name for name, r in motion.residuals.items() if r.unit == "px"]
-    places = [name for name, r in motion.residuals.items() if r.unit == "m"]
+    places = [name for name, r in motion.residuals.items() if r.unit == "m" and not name.startswith(_LIFTED)]
     out = [
         f"The motion \"{motion.name}\" ({len(motion)} frames at {motion.rate:g} Hz) was estimated with kinefit "
         f"{provenance.get('kinefit', provenance.get('version', _version()))}."

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaincc
 
 from kinefit.bodies import Body
 from kinefit.bodies.limbs import finger_groups
@@ -14,9 +15,10 @@ from kinefit.exporters.tables import DIGITS, split_side
 from kinefit.findings import listed, runs_of
 from kinefit.motion import Motion, Residuals
 
-DOUBT_DISTANCE_M = 0.08  # [m] from the truth: about as thick as a limb, which then lies beside itself
-_DOUBTFUL = 0.11  # [m] root of the summed variances, above which `DOUBT_DISTANCE_M` is likely exceeded: 9 cm of an
-# error that is alike in all directions, 12 of one along a line; on simulated takes of all sensors 10 were 45 to 61 %
+DOUBT_DISTANCE_M = 0.05  # [m] from the truth: about half as thick as a limb, which then lies beside itself
+_DOUBTFUL = 0.5  # probability that an end is farther off, above which a segment is doubtful
+_MAX_CONTRADICTION_M = 0.08  # [m] of points beside the fit; of 91 segments beyond it in simulated takes 11 were wrong
+_MIN_VARIANCE_M2 = 1e-12  # of an end that is exact
 _FLAT_ROOT_SIGMA = 1.0  # [m, rad] of a root that nothing holds
 _MAX_STD = 1e3  # [rad, m] of a coordinate without a prior
 _WINDOW = 0.05  # [s] to either side, in which most views must contradict: an outlier is alone
@@ -26,46 +28,69 @@ _GAP = 0.1  # [s] stretches nearer than this are one to somebody who looks at th
 _MIN_OUTLIER_SHARE = 0.25  # reported as a cause; fits of good keypoints reject less than a tenth
 
 
-def doubtful(sigmas: NDArray, against: NDArray) -> NDArray:
-    """(F, S) bool: segments of which an end is rather more than 8 cm off than not, or is so in most views.
+def doubtful(likely: NDArray, against: NDArray) -> NDArray:
+    """(F, S) bool: segments of which an end is rather more than 5 cm off than not, or is so in most views.
 
-    By `end_sigmas` and `contradicted`.
+    By `probably_far` and `contradicted`.
     """
-    return np.asarray((sigmas > _DOUBTFUL) | against)
+    return np.asarray((likely > _DOUBTFUL) | against)
+
+
+def probably_far(variances: NDArray) -> NDArray:
+    """(F, S) probability that the less certain end of each segment is more than 5 cm off, by `end_variances`.
+
+    The square of the distance is a sum of three squared normal errors; it counts as a gamma distribution of the same
+    mean and variance (Satterthwaite 1946, Biometrics Bulletin 2:110).
+    """
+    variances = np.maximum(variances, _MIN_VARIANCE_M2)
+    mean, twice = variances.sum(axis=-1), 2.0 * np.square(variances).sum(axis=-1)
+    return np.asarray(gammaincc(mean**2 / twice, DOUBT_DISTANCE_M**2 * mean / twice))
 
 
 def uncertain_throughout(motion: Motion) -> dict[str, float]:
-    """Segments with an end that is uncertain by more than 8 cm in most frames, and its median sigma [m]."""
+    """Segments with an end that is rather more than 5 cm off in most frames, and its median sigma [m]."""
     if not motion.residuals or not len(motion):
         return {}
-    middle = np.median(end_sigmas(motion), axis=0)
-    return {name: float(m) for name, m in zip(motion.body.tree.segments, middle) if m > DOUBT_DISTANCE_M}
+    variances, bare = end_variances(motion), 2 * unmarked(motion).sum(axis=0) > len(motion)
+    often = np.median(probably_far(variances), axis=0) > _DOUBTFUL
+    sigma = np.median(np.sqrt(variances.sum(axis=-1)), axis=0)
+    return {name: float(sigma[s]) for s, name in enumerate(motion.body.tree.segments) if often[s] and not bare[s]}
 
 
-def end_sigmas(motion: Motion) -> NDArray:
-    """(F, S) [m] standard deviation, in all directions together, of the less certain end of each segment."""
+def unmarked(motion: Motion) -> NDArray:
+    """(F, S) bool: segments that are not observed, as no marker on them is seen and no other sensor looked."""
+    bare = motion.lost & (motion.quality > 0)[:, None]
+    markers = [r for r in motion.residuals.values() if r.of_points and r.unit == "m"]
+    if not markers or len(markers) < len(motion.residuals):
+        return np.zeros_like(bare)
+    for r in markers:
+        for s in np.unique(r.segments):
+            bare[:, s] &= ~np.isfinite(r.norms[:, r.segments == s]).any(axis=1)
+    return bare
+
+
+def end_variances(motion: Motion) -> NDArray:
+    """(F, S, 3) [m²] of the less certain end of each segment, along the world's axes."""
     tree, surfaces = motion.body.tree, motion.body.segment_ends()
     prior = np.concatenate([np.full(6, _FLAT_ROOT_SIGMA), np.minimum(tree.posture_std, _MAX_STD)])
     std = np.where(np.isfinite(motion.dof_std), motion.dof_std, prior)
-    known = np.linalg.norm(motion.joint_std, axis=-1)
-    unbounded = ~np.isfinite(known)
-    sigma = np.where(unbounded, 0.0, known)
+    unbounded = ~np.isfinite(motion.joint_std).all(axis=-1, keepdims=True)
+    own = np.where(unbounded, 0.0, np.square(motion.joint_std))
     for s, parent in enumerate(tree.parents):  # of an unbounded one what is known of the joint before it
         if parent >= 0:
-            sigma[:, s] = np.where(unbounded[:, s], sigma[:, parent], sigma[:, s])
-    for f in np.flatnonzero(unbounded.any(axis=1)):
+            own[:, s] = np.where(unbounded[:, s], own[:, parent], own[:, s])
+    for f in np.flatnonzero(unbounded.any(axis=(1, 2))):
         alone = np.where(np.isfinite(motion.dof_std[f]), 0.0, prior)
-        unknown = np.sqrt(_square_moves(motion, int(f)) @ np.square(alone))
-        sigma[f] = np.where(unbounded[f], np.hypot(sigma[f], unknown), sigma[f])
-    out = sigma.copy()
+        unknown = _square_moves(motion, int(f)) @ np.square(alone)
+        own[f] += np.where(unbounded[f], unknown[:, None] / 3.0, 0.0)
+    out = own.copy()
     for s in range(len(tree.segments)):
-        children = np.flatnonzero(tree.parents == s)
-        if len(children):
-            out[:, s] = np.maximum(sigma[:, s], sigma[:, children].max(axis=1))
-        elif s in surfaces:
-            own = np.flatnonzero(tree.owners == s)
-            levers = np.linalg.norm(np.cross(tree.axes[own], surfaces[s]), axis=-1)
-            out[:, s] = np.sqrt(np.square(sigma[:, s]) + np.square(std[:, 6 + own]) @ np.square(levers))
+        ends = own[:, [s, *np.flatnonzero(tree.parents == s)]]
+        out[:, s] = np.take_along_axis(ends, ends.sum(axis=2).argmax(axis=1)[:, None, None], axis=1)[:, 0]
+        if ends.shape[1] == 1 and s in surfaces:
+            turns = np.flatnonzero(tree.owners == s)
+            levers = np.linalg.norm(np.cross(tree.axes[turns], surfaces[s]), axis=-1)
+            out[:, s] += (np.square(std[:, 6 + turns]) @ np.square(levers))[:, None] / 3.0
     return out
 
 
@@ -79,7 +104,7 @@ def contradicted(motion: Motion) -> NDArray:
         owners, there = np.asarray(r.segments), np.isfinite(r.norms)
         fitted = np.where(there[..., None], r.measured - r.values, np.nan)
         joints = np.where(there[..., None], motion.joint_centres[:, owners], np.nan)
-        far = r.norms > DOUBT_DISTANCE_M * _pixels_per_metre(fitted, joints)[:, None]
+        far = r.norms > _MAX_CONTRADICTION_M * _pixels_per_metre(fitted, joints)[:, None]
         for s in np.unique(owners):
             count = there[:, owners == s].sum(axis=1)
             seen[:, s] += count > 0
@@ -154,9 +179,8 @@ class _Doubt:
 def doubtful_moments(motion: Motion) -> tuple[Moment, ...]:
     """All doubtful moments, the worst first.
 
-    Doubtful is a frame without anybody, and a segment of which an end is rather more than 8 cm off than not (see
-    `doubt.doubtful`). Where it is so in most frames, see `throughout_sentence`, those are left that views contradict,
-    and those that are twice as uncertain as in the median.
+    Doubtful is a frame without anybody, and a segment that is `doubtful`. Where it is so in most frames, see
+    `throughout_sentence`, those are left that views contradict, and those that are twice as uncertain as in the median.
     """
     found = [*_nobody(motion), *_doubts(motion)]
     with_causes = [replace(m, causes=causes(motion, m)) for m in _merged(motion.body, found)]
@@ -174,7 +198,7 @@ def doubt_sentence(motion: Motion, moments: Sequence[Moment]) -> str:
 
 
 def throughout_sentence(motion: Motion) -> str:
-    """Segments with an end that is uncertain by more than 8 cm in most frames, with 2 σ; empty where there is none."""
+    """Segments with an end that is rather more than 5 cm off in most frames, with 2 σ; empty where there is none."""
     sigmas = uncertain_throughout(motion)
     if len(sigmas) == len(motion.body.tree.segments):
         return f"the whole body (±{200 * min(sigmas.values()):.0f} to {200 * max(sigmas.values()):.0f}\u00a0cm)"
@@ -234,9 +258,9 @@ def plain(segment: str) -> str:
     return f"{side} {f'{DIGITS[digit].lower()} ({bone})' if bone and digit in DIGITS else name}".strip()
 
 
-def spoken_segments(body: Body, segments: Sequence[str]) -> str:
+def spoken_segments(body: Body, segments: Sequence[str], most: int = 4) -> str:
     """Segments in words, each once; several fingers of a hand together: "fingers of the left hand"."""
-    return listed(dict.fromkeys(_spoken(body, segments).values()) or ["whole body"], 4)
+    return listed(dict.fromkeys(_spoken(body, segments).values()) or ["whole body"], most)
 
 
 def _spoken(body: Body, segments: Sequence[str]) -> dict[str, str]:
@@ -258,8 +282,9 @@ def _doubts(motion: Motion) -> Iterable[_Doubt]:
     if not motion.residuals:
         return
     share = 1 / len(motion.body.tree.segments)
-    sigma, against = end_sigmas(motion), contradicted(motion)
-    flags = doubtful(sigma, against) & (motion.quality > 0)[:, None]
+    variances, against = end_variances(motion), contradicted(motion)
+    sigma = np.sqrt(variances.sum(axis=-1))
+    flags = doubtful(probably_far(variances), against) & (motion.quality > 0)[:, None] & ~unmarked(motion)
     unbounded = ~np.isfinite(motion.joint_std).all(axis=-1)
     often = 2 * flags.sum(axis=0) > len(motion)
     flags &= ~often | against | (sigma > 2 * np.median(sigma, axis=0))

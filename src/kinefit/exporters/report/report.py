@@ -41,7 +41,9 @@ from kinefit.exporters.report.moments import (
     doubtful_moments,
     never_observed,
     shared_by_prior,
+    spoken_segments,
     throughout_sentence,
+    unmarked,
 )
 from kinefit.exporters.tables import curves, spoken
 from kinefit.findings import listed, of_provenance
@@ -104,21 +106,21 @@ def write_report(
     if not len(motion):
         raise ExportError("a motion without frames has nothing to report", file=path, remedy="Track the take first.")
     date = date or datetime.date.today().isoformat()
-    moments, shown = doubtful_moments(motion), pictures or {}
+    moments, throughout, shown = doubtful_moments(motion), throughout_sentence(motion), pictures or {}
     cycles = find_cycles(motion)
     _check_norms(motion, norms, path)
     width = round(640 * min(1.0, (_BUDGET / max(1, sum(map(len, shown.values())))) ** 0.5))
     sections = [
         *p.fault_sections(of_provenance(motion.provenance)),
-        _summary(motion, moments, list(findings), date),
+        _summary(motion, moments, throughout, list(findings), date),
         p.section("Moving figure", figure(motion, rig), p.paragraph(
             "Drag to turn. Click, then use the wheel (or two fingers) to zoom. Blue is left, orange right. Parts "
             "that are grey and dashed are lost; translucent parts are uncertain. Cylinders shows the surfaces of the "
             "fit. Click a time on this page, or a plot over time, to move the figure to that time.", small=True)),
         p.section("Angles", *_angles(motion)),
         p.section("Cycles", *_cycles(motion, cycles, norms or {})),
-        *([p.section("Limits", *limits)] if (limits := _limits(motion)) else []),
-        p.section("Doubtful moments", *flagged(motion, moments, shown, width)),
+        *([p.section("Limits", *limits)] if (limits := _limits(motion, throughout)) else []),
+        p.section("Doubtful moments", *flagged(motion, moments, throughout, shown, width)),
         p.section("Fit to the measurements", *_fit(motion, moments)),
     ]  # fmt: skip
     if shown:
@@ -150,12 +152,12 @@ def _subtitle(motion: Motion, date: str) -> str:
 
 
 def _summary(
-    motion: Motion, moments: Sequence[Moment], findings: Sequence[tuple[str, str, str]], date: str
+    motion: Motion, moments: Sequence[Moment], throughout: str, findings: Sequence[tuple[str, str, str]], date: str
 ) -> p.Section:
     """What was found, how sure it is and what to do, in five lines and one table of ranges."""
     found, session = all_ranges(motion), motion.provenance.get("session")
     sure = [one for one in found if one.is_sure]
-    severity, trust = _trust(motion, moments)
+    severity, trust = _trust(motion, moments, throughout)
     facts = {}
     if isinstance(session, Mapping):
         facts = {SESSION.get(key, str(key)): str(value) for key, value in session.items() if value}
@@ -193,13 +195,15 @@ def _summary(
     )  # fmt: skip
 
 
-def _trust(motion: Motion, moments: Sequence[Moment]) -> tuple[str, str]:
+def _trust(motion: Motion, moments: Sequence[Moment], throughout: str) -> tuple[str, str]:
     """How far the motion can be trusted: severity of a box, and the sentence."""
-    poor = float(np.mean(motion.quality < POORLY_SUPPORTED))
+    poor = float(np.mean(motion.quality < POORLY_SUPPORTED * (1.0 - unmarked(motion).mean(axis=1))))
     unobserved = float(np.mean(motion.quality <= 0))
     wrong = unobserved > 0.1 or poor > 0.5 or of_provenance(motion.provenance)
-    severity = "bad" if wrong else "warning" if moments else "good"
+    severity = "bad" if wrong else "warning" if moments or throughout else "good"
     parts = [trust_sentence(motion, moments)]
+    if throughout:
+        parts.append(f" Uncertain in most frames, at the far end (2 σ): {throughout}.")
     if moments:
         parts += [" See ", p.link("doubtful-moments", "where and why"), "."]
     if unobserved:
@@ -242,7 +246,7 @@ def _what_to_do(motion: Motion, moments: Sequence[Moment]) -> str:
     return "nothing."
 
 
-def _limits(motion: Motion) -> list[p.Html]:
+def _limits(motion: Motion, throughout: str) -> list[p.Html]:
     """What the measurements do not tell, and what does not fit."""
     parts = []
     shifted = [f for f in sensor_fits(motion) if f.is_shifted]
@@ -253,11 +257,16 @@ def _limits(motion: Motion) -> list[p.Html]:
             "image size, not to the person: run kinefit check on the take."
         )
         parts.append(p.callout("warning", f"Constant shift in {shifts}.", text))
-    if throughout := throughout_sentence(motion):
+    if throughout:
         parts.append(p.callout("note", f"Uncertain in most frames, at the far end (2 σ): {throughout}."))
-    blind = never_observed(motion)
+    bare = np.flatnonzero(2 * unmarked(motion).sum(axis=0) > len(motion))
+    text = "No measurement observes them. Their values come from the prior and are no results."
+    if len(bare):
+        names = spoken_segments(motion.body, [motion.body.tree.segments[s] for s in bare], 20)
+        parts.append(p.callout("note", f"Not observed, as they have no markers: {names}.", text))
+    angles_of_bare = {motion.body.tree.coordinates[d] for d in np.flatnonzero(np.isin(motion.body.tree.owners, bare))}
+    blind = [name for name in never_observed(motion) if name not in angles_of_bare]
     if blind:
-        text = "No measurement observes them. Their values come from the prior and are no results."
         most = len(blind) > 0.5 * len(motion.body.dof_names)
         title = f"Not observed: {listed([spoken(name) for name in blind], 8)}."
         parts.append(p.callout("bad" if most else "note", title, text))

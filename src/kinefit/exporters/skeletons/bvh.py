@@ -52,10 +52,11 @@ def write_bvh(
         Unit of length in the file; the format does not state it.
     up : str
         Vertical axis of the file's world.
-    names : "bvh", "mixamo", "cmu", "opensim", "hanim" or "kinefit"
+    names : "bvh", "kinefit", "mixamo", "cmu", "opensim", "hanim", "vrm", "unity" or "unreal"
         Names of the joints; "bvh": the usual ones (Hips, RightUpLeg ...).
     rest : "body" or "t", optional
-        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with Mixamo's names.
+        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with the
+        names of Mixamo, VRM, Unity and Unreal.
 
     Raises
     ------
@@ -133,10 +134,11 @@ def write_x3d(motion: Motion, path: str | PathLike[str], *, names: str | None = 
     ----------
     motion : Motion
     path : path
-    names : "hanim", "kinefit", "mixamo", "cmu", "opensim" or "bvh", optional
+    names : "hanim", "kinefit", "mixamo", "cmu", "opensim", "bvh", "vrm", "unity" or "unreal", optional
         Names of the joints. Default: "hanim" for a body that has such names, else its own.
     rest : "body" or "t", optional
-        Rest pose: arms hanging, facing z; or a T facing z. Default: "t" with Mixamo's names.
+        Rest pose: arms hanging, facing z; or a T facing z. Default: "t" with the
+        names of Mixamo, VRM, Unity and Unreal.
 
     Raises
     ------

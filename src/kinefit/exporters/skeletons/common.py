@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body
+from kinefit.bodies.joint_names import CHARACTER_BONES, segment_names
 from kinefit.errors import ExportError, check_choice, spelled
 from kinefit.geometry import se3
-from kinefit.motion import UP_AXES, Motion, continuous_quaternions
+from kinefit.motion import UP_AXES, Motion, continuous_quaternions, rotation_between_up
 from kinefit.rendering.looks import TubeMesh
 
-NAMES = ("kinefit", "bvh", "mixamo", "cmu", "opensim", "hanim")
-"""Conventions of names: the body's own, then its aliases."""
+NAMES = ("kinefit", "bvh", "mixamo", "cmu", "opensim", "hanim", *CHARACTER_BONES)
+"""Conventions of names: the body's own, its aliases, those of characters in game engines."""
 
 UNITS = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 """Units of length in a metre."""
@@ -29,6 +30,24 @@ def moving_segments(body: Body) -> NDArray:
     """(S,) bool: the root, and segments whose joint can slide, so that their offset changes."""
     out = np.zeros(len(body.tree.segments), bool)
     out[body.tree.owners[body.tree.prismatic]] = out[0] = True
+    return out
+
+
+def check_frames(motion: Motion, path: str | PathLike[str]) -> None:
+    """Raise ExportError for a motion without frames."""
+    if not len(motion):
+        raise ExportError("a motion without frames cannot be animated", file=path)
+
+
+def linear_colours(colours: NDArray) -> NDArray:
+    """Colours (..., 3) of sRGB, 0 to 255, as linear intensities 0 to 1."""
+    return np.asarray((colours / 255.0) ** 2.2)
+
+
+def turning_segments(body: Body) -> NDArray:
+    """(S,) bool: the root, and segments whose joint can turn."""
+    out = np.zeros(len(body.tree.segments), bool)
+    out[body.tree.owners[~body.tree.prismatic]] = out[0] = True
     return out
 
 
@@ -52,11 +71,15 @@ def euler_zxy(rotations: NDArray, before: NDArray | None = None) -> NDArray:
     return out
 
 
-def euler(rotations: NDArray, axes: str) -> NDArray:
-    """(F, 3) [rad] angles about three different body-fixed axes in this order, without jumps, of (F, 3, 3)."""
+def euler(rotations: NDArray, axes: str, before: NDArray | None = None) -> NDArray:
+    """Angles (F, ..., 3) [rad] about three different body-fixed axes in this order, of rotations (F, ..., 3, 3).
+
+    They do not jump over F, as of `euler_zxy`. `before` (..., 3) are the angles of the frame before the first.
+    """
     i, j, k = ("xyz".index(axis) for axis in axes)
-    as_zxy = rotations[:, [[j], [k], [i]], [j, k, i]]  # axes renamed; where that mirrors, turns go the other way
-    return euler_zxy(as_zxy) * (1.0 if (j - i) % 3 == 1 else -1.0)
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    as_zxy = rotations[..., [[j], [k], [i]], [j, k, i]]  # axes renamed; where that mirrors, turns go the other way
+    return sign * euler_zxy(as_zxy, None if before is None else sign * before)
 
 
 def _nearest_zxy(R: NDArray, before: NDArray) -> NDArray:
@@ -83,11 +106,12 @@ def bone_names(body: Body, names: str, path: str | PathLike[str]) -> list[str]:
     """
     names = convention(names)
     check_choice("convention of names", names, NAMES, ExportError, file=path)
-    if names not in ("kinefit", "bvh") and not body.aliases.get(names):
-        known = ", ".join(["kinefit", *(name for name in NAMES if body.aliases.get(name))])
+    found = segment_names(body, names)
+    if names not in ("kinefit", "bvh") and not found:
+        known = ", ".join(["kinefit", *(name for name in NAMES if segment_names(body, name))])
         remedy = f"It has those of: {known}. Or write them into its body file: names = {{ {names} = ... }}."
         raise ExportError(f"body '{body.name}' has no names of {names}", file=path, remedy=remedy)
-    return plain_names(body.alias(names, segment) for segment in body.tree.segments)
+    return plain_names(found.get(segment, segment) for segment in body.tree.segments)
 
 
 def convention(names: str) -> str:
@@ -124,6 +148,8 @@ def plain_names(names: Iterable[str]) -> list[str]:
         out.append(plain)
     return out
 
+
+_T_NAMES = ("mixamo", *CHARACTER_BONES)  # whose characters rest with arms out to the sides, or nearly so
 
 RESTS = ("body", "t")
 """Rest poses: the body's own (arms hanging, facing x), or arms out to the sides, palms down, facing z."""
@@ -171,6 +197,14 @@ class Rest:
             places.append(Ts[..., :3, 3].copy())
         return np.concatenate(turns), np.concatenate(places)
 
+    def matrices(self, up: str, factor: float) -> tuple[NDArray, NDArray]:
+        """Poses (S, 4, 4) of bones in their parent's frame and in the world of `up`; lengths times `factor`."""
+        upright = se3.transform(rotation_between_up("y", up), np.zeros(3))
+        local = np.tile(np.eye(4), (len(self.offsets), 1, 1))
+        local[:, :3, 3] = factor * self.offsets
+        local[0] = upright @ local[0]
+        return local, upright @ se3.transform(np.eye(3), factor * self.positions)
+
     def posed(self, mesh: TubeMesh, body: Body) -> TubeMesh:
         """A mesh about the body, which rests as the body does, in this rest pose."""
         if not len(mesh.vertices):
@@ -188,14 +222,14 @@ class Rest:
 
 
 def rest_pose(body: Body, rest: str | None, names: str, path: str | PathLike[str]) -> Rest:
-    """A rest pose of `RESTS`; None: "t" where joints are named as Mixamo's, whose figures rest so, else "body".
+    """A rest pose of `RESTS`; None: "t" with the names of Mixamo, VRM, Unity or Unreal, else "body".
 
     Raises
     ------
     ExportError
         An unknown rest pose; `path` for the message.
     """
-    rest = rest or ("t" if convention(names) == "mixamo" else "body")
+    rest = rest or ("t" if convention(names) in _T_NAMES else "body")
     check_choice("rest pose", rest, RESTS, ExportError, file=path)
     count = len(body.tree.segments)
     turns = np.tile(np.eye(3), (count, 1, 1)) if rest == "body" else np.stack([_turn(body, s) for s in range(count)])

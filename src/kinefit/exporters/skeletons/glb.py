@@ -22,14 +22,16 @@ from kinefit.exporters.skeletons.common import (
     UNITS,
     Rest,
     bone_names,
+    check_frames,
     length_factor,
+    linear_colours,
     moving_segments,
     plain_names,
     rest_pose,
     turned,
+    turning_segments,
 )
-from kinefit.geometry import se3
-from kinefit.motion import Motion, rotation_between_up
+from kinefit.motion import Motion
 from kinefit.rendering.looks import TubeMesh, body_mesh
 
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
@@ -51,10 +53,11 @@ def write_glb(
     ----------
     motion : Motion
     path : path
-    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh"
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh", "vrm", "unity" or "unreal"
         Names of the joints.
     rest : "body" or "t", optional
-        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with Mixamo's names.
+        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with the
+        names of Mixamo, VRM, Unity and Unreal.
     cylinders : bool
         The body's cylinders in place of a skin.
 
@@ -63,8 +66,7 @@ def write_glb(
     ExportError
         A motion without frames, unknown names or rest pose, or the file cannot be written.
     """
-    if not len(motion):
-        raise ExportError("a motion without frames cannot be animated", file=path)
+    check_frames(motion, path)
     body, tree = motion.body, motion.body.tree
     joints, pose = bone_names(body, names, path), rest_pose(body, rest, names, path)
     nodes: list[dict[str, Any]] = []
@@ -151,11 +153,9 @@ def _add_skin(file: GltfFile, mesh: TubeMesh, pose: Rest) -> None:
 
 
 def _courses(motion: Motion, pose: Rest) -> Iterator[tuple[int, str, NDArray]]:
-    tree, moving = motion.body.tree, moving_segments(motion.body)
+    moving, turning = moving_segments(motion.body), turning_segments(motion.body)
     turns, places = pose.local_moves(motion, "y")
-    turning = np.zeros(len(tree.segments), bool)
-    turning[tree.owners[~tree.prismatic]] = turning[0] = True
-    for s in range(len(tree.segments)):
+    for s in range(len(moving)):
         if turning[s]:
             yield s, "rotation", turns[:, s]
         if moving[s]:
@@ -182,10 +182,11 @@ def write_usd(
         Ending in .usdc (binary), .usda (text) or .usd.
     unit : "m", "cm" or "mm"
     up : "y" or "z"
-    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh"
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh", "vrm", "unity" or "unreal"
         Names of the joints.
     rest : "body" or "t", optional
-        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with Mixamo's names.
+        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with the
+        names of Mixamo, VRM, Unity and Unreal.
     cylinders : bool
         The body's cylinders in place of a skin.
 
@@ -199,8 +200,7 @@ def write_usd(
         from pxr import Tf, Usd
     if Path(path).suffix not in ENDINGS:
         raise ExportError("not a name of a USD file", file=path, remedy=f"Let it end in one of {', '.join(ENDINGS)}.")
-    if not len(motion):
-        raise ExportError("a motion without frames cannot be animated", file=path)
+    check_frames(motion, path)
     factor, world = length_factor(unit, UNITS, path), turned(motion, up, path, _UPS)
     joints = joint_paths(motion.body, bone_names(motion.body, names, path))
     pose = rest_pose(motion.body, rest, names, path)
@@ -242,7 +242,7 @@ def _fill(stage: Any, motion: Motion, pose: Rest, joints: list[str], factor: flo
     root = UsdSkel.Root.Define(stage, "/Figure")
     stage.SetDefaultPrim(root.GetPrim())
     skeleton = UsdSkel.Skeleton.Define(stage, "/Figure/Skeleton")
-    rest, bind = _rest_poses(motion.body, pose, motion.up, factor)
+    rest, bind = pose.matrices(motion.up, factor)
     skeleton.CreateJointsAttr(joints)
     skeleton.CreateRestTransformsAttr([Gf.Matrix4d(T.T.tolist()) for T in rest])  # USD multiplies rows
     skeleton.CreateBindTransformsAttr([Gf.Matrix4d(T.T.tolist()) for T in bind])
@@ -264,15 +264,6 @@ def _reach(surface: Surface) -> float:
     if isinstance(surface, MeshSurface):
         return float(np.linalg.norm(surface.vertices, axis=1).max())
     return max(float(np.linalg.norm(end)) + max(r) for end, r in zip((surface.start, surface.end), surface.radii))
-
-
-def _rest_poses(body: Body, pose: Rest, up: str, factor: float) -> tuple[NDArray, NDArray]:
-    """Poses (S, 4, 4) at rest in the parent's frame and in the skeleton's, upright; lengths in the file's unit."""
-    upright = se3.transform(rotation_between_up("y", up), np.zeros(3))
-    local = np.tile(np.eye(4), (len(body.tree.segments), 1, 1))
-    local[:, :3, 3] = factor * pose.offsets
-    local[0] = upright @ local[0]
-    return local, upright @ se3.transform(np.eye(3), factor * pose.positions)
 
 
 def _animation(stage: Any, motion: Motion, pose: Rest, joints: list[str], factor: float) -> Any:
@@ -306,7 +297,7 @@ def _mesh(stage: Any, content: TubeMesh, T_skeleton_root: NDArray, factor: float
     colour = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
         "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex
     )
-    colour.Set(Vt.Vec3fArray.FromNumpy(np.float32((content.colours / 255.0) ** 2.2)))  # linear, of sRGB
+    colour.Set(Vt.Vec3fArray.FromNumpy(np.float32(linear_colours(content.colours))))
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
     binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
     followed, shares = np.int32(content.segments.ravel()), np.float32(content.weights.ravel())

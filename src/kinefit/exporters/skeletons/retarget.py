@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit._files import write_bytes, write_lines
 from kinefit.bodies import Body
-from kinefit.bodies.joint_names import DIGITS, FINGERS, SIDES, conventions, joint_map
+from kinefit.bodies.joint_names import DIGITS, FINGERS, SIDES, humanoid_segments, joint_map
 from kinefit.errors import BodyError, ExportError, FileError
 from kinefit.exporters.skeletons.bvh import bvh_motion
 from kinefit.exporters.skeletons.common import euler
@@ -144,10 +144,8 @@ def _nodes(character: Character, names: Mapping[str, str] | None) -> dict[str, i
 
 def _segments(body: Body) -> dict[str, int]:
     """Segment as the humanoid's are called -> index in a body, by its own names or by those that it gives for BVH."""
-    usual = {name: segment for f in conventions() if f.name == "bvh" for segment, name in f.joints.items()}
-    own = body.tree.segments
-    out = {usual.get(body.alias("bvh", name), name): number for number, name in enumerate(own)}
-    out |= {name: number for number, name in enumerate(own)}
+    out = {name: number for number, name in enumerate(humanoid_segments(body).values())}
+    out |= {name: number for number, name in enumerate(body.tree.segments)}
     lost = [name for name in ("pelvis", *_BODY_NEEDED) if name not in out]
     if lost:
         remedy = "A character takes the motion of a body with arms and legs, such as the humanoid."

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from websockets.exceptions import ConnectionClosed
 
 from kinefit.bodies import Body
-from kinefit.bodies.joint_names import SIDES, VRM0_FINGERS
+from kinefit.bodies.joint_names import CHARACTER_BONES
 from kinefit.errors import BodyError, ExportError
 from kinefit.exporters.report.figure import live_figure
 from kinefit.exporters.skeletons.common import Rest, rest_pose
@@ -176,13 +176,7 @@ def live_page(title: str, body: Body | None, up: str) -> Page:
     return Page(html.encode(), policy=inline_policy(scripts, [style], "connect-src 'self'"), framed_by=APP_PAGES)
 
 
-_TRUNK = {"pelvis": "Hips", "abdomen": "Spine", "thorax": "Chest", "neck": "Neck", "head": "Head", "jaw": "Jaw"}
-_SIDES = {
-    "clavicle": "Shoulder", "upperarm": "UpperArm", "forearm": "LowerArm", "hand": "Hand", "thigh": "UpperLeg",
-    "shank": "LowerLeg", "foot": "Foot", "toes": "Toes", "eye": "Eye",
-}  # fmt: skip
-BONES = _TRUNK | {f"{k}_{s}": words["Side"] + v for k, v in _SIDES.items() for s, words in SIDES.items()}
-BONES |= {segment: name[0].upper() + name[1:] for segment, name in VRM0_FINGERS.items()}
+BONES = CHARACTER_BONES["unity"]
 """{segment: bone of Unity's humanoid}."""
 
 

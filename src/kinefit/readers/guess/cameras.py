@@ -90,6 +90,12 @@ def describe_uncalibrated(draft: Draft, videos: Mapping[str, Path]) -> None:
         opened = {name: stack.enter_context(Video(path, rate=UNSTATED)) for name, path in videos.items()}
         draft.head["rate"] = draft.note_value("rate", _rate(draft, opened, []), "rate")
         counts = {name: f"{len(video)} frames" for name, video in opened.items()}
+        for one in opened.values():
+            if len(one) == 1:
+                draft.note("video", "open", f"{draft.name(one.path)}: one frame: one pose, without motion")
+            if one.size[0] == 2 * one.size[1]:
+                text = "twice as wide as high, as 360° videos: export a flat view; telephones of 18:9 look the same"
+                draft.note("video", "open", f"{draft.name(one.path)}: {text}")
     more = "10 % wider places people 10 % nearer" if len(opened) == 1 else "kinefit track estimates it with the poses"
     why = f"degrees across the longer side; {DEFAULT_FIELD_OF_VIEW:g} is typical of telephones; {more}"
     offsets = _time_codes(draft, opened)

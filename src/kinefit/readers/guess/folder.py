@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from kinefit._files import repeated
-from kinefit.errors import CalibrationError, KinefitError, PluginError, TakeError, command
+from kinefit.errors import CalibrationError, KinefitError, ObservationError, PluginError, TakeError, command
 from kinefit.geometry.camera import Rig
 from kinefit.observations.videos import DepthVideo
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.guess import files as guess_files
 from kinefit.readers.guess.cameras import describe_cameras, describe_uncalibrated
+from kinefit.readers.guess.depth_cameras import guessed_intrinsics
 from kinefit.readers.guess.draft import Draft, Entry, Note, Value
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile
 from kinefit.readers.guess.names import COUNTED, later_chapters, trials
@@ -23,6 +24,7 @@ from kinefit.readers.markers import read_markers
 from kinefit.readers.ros.images import Shown, mcap_rig, shown
 from kinefit.readers.take.entries import TABLES
 from kinefit.readers.take.kinds import KINDS, Proposal
+from kinefit.readers.video import ENDINGS
 
 _CALIBRATE = (
     "Calibrate with a board (kinefit calibrate board) or, if the cameras' intrinsics are known, from the person "
@@ -80,6 +82,9 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
     _describe_kinds(draft, files)
     videos = _describe_depth(draft, files, videos, alone=not (keypoints or markers or recordings))
     if not (videos or keypoints or markers or recordings or any(draft.tables.values())):
+        if images := [path for path in files if path.suffix.lower() in (*ENDINGS, ".heic")]:
+            such = f"{len(images)} images such as {draft.name(images[0])}"
+            draft.note("files", "open", f"{such}: a recording is a video, or 12 numbered images or more")
         said = "; ".join(note.text for note in draft.notes)
         raise TakeError(
             f"no videos, keypoints, markers, depth or recordings among {len(files)} files{said and f': {said}'}",
@@ -119,18 +124,22 @@ def _describe_depth(draft: Draft, files: Sequence[Path], videos: Sequence[Path],
     found, single = guess_files.find_depth(files)
     colour, seen = [path for path in videos if path not in found], list[DepthVideo]()
     for path in single:
-        draft.note("depth", "open", f"{draft.name(path)}: one depth image, not a recording; name it in [[depth]]")
-    for path in found:
+        draft.note("depth", "open", f"{draft.name(path)}: one depth image, not a recording: one pose, without motion")
+    pictures = [path for path in single if path.suffix != ".npy"]  # which may be any table
+    for path in found or (pictures[:1] if alone and not colour else []):
         try:
-            seen.append(read_depth(path))
+            video, rate = _depth_of(path)
         except KinefitError as error:
             draft.note("depth", "open", f"{draft.name(path)}: not used as depth: {error.problem}. {error.remedy or ''}")
             continue
-        video, is_used = seen[-1], alone and not colour and len(seen) == 1
-        why = f"{len(video)} depth images of {video.size[0]}x{video.size[1]} px"
-        entry = {"name": Value(path.stem), "file": Value(path, "likely", why)}
+        seen.append(video)
+        is_used = alone and not colour and len(seen) == 1
+        why = f"{len(video)} depth image{'s' * (len(video) > 1)} of {video.size[0]}x{video.size[1]} px"
+        entry = {"name": Value(path.stem), "file": Value(path, "likely", why)} | rate
         if video.camera is None:
-            entry["intrinsics"] = Value(None, "open", "[fx, fy, cx, cy] in pixels of the depth image")
+            entry["intrinsics"] = guessed_intrinsics(Path(draft.folder.name) / draft.name(path), video.size)
+            if is_used:
+                draft.note_value("intrinsics", entry["intrinsics"], "intrinsics")
         draft.tables["depth"].append((is_used, entry))
         aside = "" if is_used else "; a comment, its pose among the other sensors is not stated"
         for text in (f"{draft.name(path)}: {why}{aside}", *video.notes):
@@ -138,6 +147,15 @@ def _describe_depth(draft: Draft, files: Sequence[Path], videos: Sequence[Path],
         if is_used:
             draft.head["up"] = draft.note_value("up", _up(None), "up")
     return colour
+
+
+def _depth_of(path: Path) -> tuple[DepthVideo, dict[str, Value]]:
+    """A recording of depth, and its entry `rate` where no file states one."""
+    try:
+        return read_depth(path, usual_rate=None), {}
+    except ObservationError:
+        video = read_depth(path)
+        return video, {"rate": Value(video.rate, "guess", "that of nearly every depth camera: its files state none")}
 
 
 def _describe_kinds(draft: Draft, files: Sequence[Path]) -> None:
@@ -261,20 +279,25 @@ def _describe_markers(draft: Draft, files: Sequence[Path]) -> None:
         )
     moving = [path for path in records if not STATIC.search(path.name)]
     used = next(iter(moving or records), None) if not draft.cameras else None
+    still = next((path for path, record in records.items() if moving and used and path not in moving
+                  and {*record.names} & {*records[used].names}), None)  # fmt: skip
     for path, record in records.items():
         file = Value(path, "sure", f"{len(record.names)} markers, {len(record.positions)} frames, {record.rate:g} Hz")
-        draft.tables["markers"].append((path == used, {"file": file}))
+        trial = {"static": Value(still, "guess", "by its name, of the same person")} if path == used and still else {}
+        draft.tables["markers"] += [(path == used, {"file": file} | trial)] if path != still else []
         for text in record.notes:
             draft.note("markers", "open", text)
     if used is not None:
         record = records[used]
-        extent = np.nanmedian(np.nanmax(record.positions, 1) - np.nanmin(record.positions, 1), axis=0)
+        shown = record.positions[np.isfinite(record.positions[..., 0]).any(axis=1)]
+        extent = np.median(np.nanmax(shown, 1) - np.nanmin(shown, 1), axis=0)
         up = Value("xyz"[int(np.nanargmax(extent))], "likely", f"markers spread {np.nanmax(extent):.2f} m along it")
         up = Value(record.up, "sure", "stated by the file") if record.up else up
         draft.head = {"rate": Value(record.rate, "sure", "of the markers"), "up": draft.note_value("up", up, "up")}
         draft.note("markers", "sure" if len(records) == 1 else "guess", f"{draft.name(used)}: used")
-        draft.note("markers", "sure", "kinefit.fit_markers fits a body to them; kinefit track needs cameras")
-    left = len(records) - (used is not None)
+        if still:
+            draft.note("markers", "guess", f"{draft.name(still)}: the static trial, for lengths and marker offsets")
+    left = len(records) - (used is not None) - (still is not None)
     if left:
         reason = "results of other programs, or" if draft.cameras else ""
         draft.note("markers", "guess", f"{left} files are comments: {reason} other recordings".replace("  ", " "))

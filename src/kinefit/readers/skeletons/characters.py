@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import parse_toml, read_text
-from kinefit.bodies.joint_names import ENDS, FAMILIES, FINGERS, SEGMENTS, VRM0_FINGERS, VRM1_FINGERS
+from kinefit.bodies.joint_names import CHARACTER_BONES, ENDS, FINGERS, SEGMENTS, VRM0_FINGERS
 from kinefit.bodies.limbs import FACE
 from kinefit.errors import FileError, check_choice, names_file
 from kinefit.motion import rotation_between_up
@@ -206,8 +206,7 @@ def _vrm_joints(file: Mapping[str, Any]) -> dict[str, int]:
     new = more.get("VRMC_vrm", {}).get("humanoid", {}).get("humanBones", {})
     old = more.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
     bones = {name: bone["node"] for name, bone in new.items()} | {bone["bone"]: bone["node"] for bone in old}
-    joints = next(family for family in FAMILIES if family.name == "VRM, Unity").joints
-    joints |= (VRM1_FINGERS if new else VRM0_FINGERS) | {segment: known[0] for segment, known in FACE.items()}
+    joints = CHARACTER_BONES["vrm"] | ({} if new else VRM0_FINGERS)
     out = {segment: int(bones[name]) for segment, name in joints.items() if name in bones}
     if wrong := [name for name, node in out.items() if not 0 <= node < len(file["nodes"])]:
         raise ValueError(f"humanBones names a node for {wrong[0]} that the file does not have")

@@ -84,6 +84,11 @@ def _head(take: Take) -> _Odd:
             yield f"'{key}' has no use with start, which gives the body", f"[take] {key}", "Remove one of the two."
         if take.size is False and key != "size" and getattr(take, key) is not None:
             yield f"'{key}' has no use with size = false", f"[take] {key}", "Remove one of the two."
+    for k, entry in enumerate(take.markers):
+        unused = len({one.camera for one in take.keypoints}) > 1 or k or entry.model
+        if entry.static is not None and (unused or take.subject or take.start or take.size is False):
+            remedy = "Remove it. It is for the first [[markers]] with labels, where nothing else gives the lengths."
+            yield "'static' has no use here", f"[[markers]] {k + 1}", remedy
     others = (take.markers, take.depth, take.stereo, take.skin, take.sensors)
     if take.calibration and take.calibration.position_sigma is not None and not take.keypoints and any(others):
         yield "position_sigma and rotation_sigma are for cameras with keypoints", "[calibration]", "Remove both."

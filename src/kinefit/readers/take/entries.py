@@ -189,6 +189,7 @@ class MarkersEntry(PlacedEntry, frozen=True, kw_only=True):
     set: str | None = None  # the body's marker set that its labels belong to; default: the one that fits
     sides: Literal["labelled", "exchanged", "mirrored-x", "mirrored-y", "mirrored-z"] | None = None  # None: checked
     model: Path | None = None  # of the subject, for markers without names; default: they have names
+    static: Path | None = None  # labelled static trial of the same subject, for lengths and marker offsets
 
     def __post_init__(self) -> None:
         odd = self.unit is not None and worth(self.unit, LENGTHS) is None

@@ -182,7 +182,9 @@ def find_take(path: str | PathLike[str], *, wanted: Sequence[str] = ("track",)) 
     if path.is_dir():
         found = takes_in(path)
         if not found:
-            raise FileError("no take file in this folder", file=path, remedy=f"Write one: {command('init', path)}")
+            hidden = next(path.glob("*.toml.txt"), None)  # as Windows names it, which shows no endings
+            remedy = f"Rename {hidden.name} to {hidden.stem}." if hidden else f"Write one: {command('init', path)}"
+            raise FileError("no take file in this folder", file=path, remedy=remedy)
         if len(found) > 1 and not is_default_take(found[0]):
             names = ", ".join(file.name for file in found[:10])
             raise TakeError(f"{len(found)} take files in this folder: {names}", file=path, remedy="Name one of them.")

@@ -105,6 +105,8 @@ class Observations:
         What is worth saying: depth of another rate, frames that are missing.
     first_time : float [s]
         Time of step 0: that of the first frame in a take of markers alone, so that forces of the trial stay in step.
+    static_markers : tuple of Markers or None
+        Static trial of each of `markers`.
     """
 
     rate: float
@@ -121,6 +123,7 @@ class Observations:
     sensors: tuple[TakeSensor, ...] = ()
     notes: tuple[str, ...] = ()
     first_time: float = 0.0
+    static_markers: tuple[Markers | None, ...] = ()
 
     if not TYPE_CHECKING:
 
@@ -209,7 +212,8 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         raise TakeError("cameras that are not calibrated yet", file=take.path, remedy=remedy)
     images = {entry.name: image_frame(entry, rig, sizes.get(entry.name), take) for entry in take.cameras}
     of_cameras = TakeCameras(take, rig, images, clocks, rates, streams, sizes)
-    keypoints, markers = [], tuple(_read_markers(entry) for entry in take.markers)
+    keypoints, markers = [], tuple(_read_markers(entry, entry.file) for entry in take.markers)
+    static_markers = tuple(_read_markers(e, e.static) if e.static else None for e in take.markers)
     for number, source in enumerate(take.keypoints):
         read, times = _read_keypoints(source, of_cameras, number)
         stream = f"keypoints {source.camera}" + f" ({source.format})" * (len(take.keypoints) > len(take.cameras))
@@ -250,8 +254,11 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         frames = take.frames or _span(dense or recordings or clicks, rate)
     else:
         first_time = float(min(times[0] for _, times in marked))
-        end = max(times[-1] + 1.0 / m.rate for (_, times), m in zip(marked, markers))
-        frames, marked = take.frames or (0, round((end - first_time) * rate)), []
+        shown = [m.trimmed() for m in markers]
+        starts = [e.time_offset + m.first_time for e, m in zip(take.markers, shown)]
+        seen = min(starts), max(start + len(m) / m.rate for start, m in zip(starts, shown))
+        notes += [note for m, all_of in zip(shown, markers) for note in m.notes[len(all_of.notes) :] if not take.frames]
+        frames, marked = take.frames or (round((seen[0] - first_time) * rate), round((seen[1] - first_time) * rate)), []
     kinds = {LineVideo: "lines of camera ", KeypointVideo: "keypoints of camera ", DepthVideo: "depth ",
              CloudVideo: "depth "}  # fmt: skip
     others = [(f"{kinds.get(type(r), '')}{r.sensor}", r.times) for r in (*recordings, *skin)]
@@ -266,7 +273,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     cameras += [video.camera for video in depth if video.camera is not None]
     return Observations(
         rate=rate, frames=frames, rig=Rig(tuple(cameras)) if cameras else None,
-        markers=markers,
+        markers=markers, static_markers=static_markers,
         keypoints=tuple(_cut(*k, rate, frames, entry) for k, entry in zip(keypoints, take.keypoints)),
         videos={e.name: e.video for e in take.cameras if e.video is not None}, images=images,
         depth=depth, clouds=clouds, sensors=sensors, skin=skin,
@@ -328,9 +335,9 @@ def _read_keypoints(source: KeypointsEntry, cameras: TakeCameras, number: int) -
     return record.first_points(source.set, MEDIAPIPE_33) if source.set and hands_unwanted else record, times
 
 
-def _read_markers(entry: MarkersEntry) -> Markers:
-    """A marker recording in the take's world."""
-    markers = read_markers(entry.file, unit=entry.unit)
+def _read_markers(entry: MarkersEntry, file: Path) -> Markers:
+    """The marker recording of an entry, or its static trial, in the take's world."""
+    markers = read_markers(file, unit=entry.unit)
     if entry.sides:
         names, positions = read_sides(markers.names, markers.positions, entry.sides)
         markers = replace(markers, names=names, positions=positions)
