@@ -185,6 +185,7 @@ class Recovery:
         elapsed = abs(time - self._good[0])
         known = self._root if elapsed <= _TURN + 1e-6 else None
         here = None if result is None or _astray(result, self.settings.poor) else result.state.T_world_root
+        began = result
         for states in starts_from_views(
             scene, frames, self.up, own.measurements(frames, scene, points=True),
             backgrounds=own.stated, forward=None if known is None else known[:3, 0],
@@ -198,13 +199,29 @@ class Recovery:
                 found = tracker.fitted(time, frames, state).result
                 poor = _astray(found, self.settings.poor)
                 allowed = not poor if result is None else not poor or _astray(result, self.settings.poor)
-                if allowed and (result is None or _better(found, result) or _explains(search, found, result)):
+                if allowed and self._preferred(tracker, found, result, began, search):
                     result, self._lost_since = found, time
                     tracker.restart(found)
             if result is not None and not _astray(result, self.settings.poor):
                 if search is None or search.score.missing(result.state) <= LEAP:
                     break  # another attempt costs as much
         return result
+
+    def _preferred(
+        self, tracker: Searching, new: FrameResult, old: FrameResult | None, began: FrameResult | None,
+        search: PostureSearch | None,
+    ) -> bool:  # fmt: skip
+        """Whether a start is taken in place of what was tracked, or of another start: of these the view decides.
+
+        A body that faces away from the sensor shows as many segments as one that faces it.
+        """
+        if old is None or old is began:
+            return old is None or _better(new, old) or _explains(search, new, old)
+        view = self._search(tracker, old.time, old.measurements, old)
+        if view is None or _gone(new.state.T_world_root, old.state.T_world_root) > _STRIDE:
+            return _better(new, old)
+        values = [view.value(r.state) - LEAP * _against(tracker, r) for r in (new, old)]
+        return values[0] > values[1]
 
     def _limbs(
         self, tracker: Searching, time: float, frames: Sequence[Any], search: PostureSearch, result: FrameResult,
