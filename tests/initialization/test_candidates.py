@@ -14,6 +14,7 @@ from kinefit.frame.routing import Sensors
 from kinefit.initialization.candidates import (
     LEAP,
     MIN_GAIN,
+    MIN_LOST_GAIN,
     dofs_of_limbs,
     find_limbs,
     starts_from_points,
@@ -114,7 +115,7 @@ def test_the_dofs_of_a_limb_are_those_of_all_of_it():
 
 def test_a_limb_that_is_somewhere_else_is_found(search):
     wrong, wrist = turned(TRUTH, arm_add_l=-80, elbow_flex_l=60), BODY.landmarks.names.index("l_wrist")
-    found = find_limbs(search, wrong, segments("forearm_l", "upperarm_l"))
+    found = find_limbs(search, wrong, segments("forearm_l", "upperarm_l"), segments())
     assert off(wrong, 0)[wrist] > 0.4 and min(off(state, 0)[wrist] for state, _ in found) < 0.08
     now = search.score.of(wrong)
     for state, least in found:
@@ -125,19 +126,42 @@ def test_a_limb_that_is_somewhere_else_is_found(search):
 def test_the_same_is_found_again(search):
     wrong, seek = turned(TRUTH, arm_add_l=-80), segments("forearm_l")
     one, other = (
-        find_limbs(PostureSearch(BODY, search.view, UP, np.random.default_rng(0)), wrong, seek, tries=40)
+        find_limbs(PostureSearch(BODY, search.view, UP, np.random.default_rng(0)), wrong, seek, seek, tries=40)
         for _ in range(2)
     )
     assert [s.angles.tolist() for s, _ in one] == [s.angles.tolist() for s, _ in other]
 
 
 def test_a_limb_that_is_where_it_is_does_not_leap(search):
-    for state, least in find_limbs(search, TRUTH, segments("forearm_l"), tries=60):
+    for state, least in find_limbs(search, TRUTH, segments("forearm_l"), segments(), tries=60):
         assert least == MIN_GAIN and off(state, 0).max() < 0.1
 
 
+@pytest.mark.parametrize("side", ["l", "r"])
+def test_an_arm_stretched_at_the_camera_is_found(side):
+    hanging, camera = BODY.usual_state(TRUTH.T_world_root), a_rig()["depth"]
+    truth = turned(hanging, **{f"arm_flex_{side}": 85, f"elbow_flex_{side}": 10})
+    depth, wrist = render_body(BODY, truth, camera).depth, BODY.landmarks.names.index(f"{side}_wrist")
+    person = np.isfinite(depth)
+    view = view_of(np.where(person, depth, 0.0), person, camera)
+    for seed in (0, 1):
+        search = PostureSearch(BODY, view, UP, np.random.default_rng(seed))
+        limb = next(limb for limb in search.limbs if BODY.tree.segment(f"forearm_{side}") in limb)
+        found, _ = search.limb(hanging, limb, None, search.ends(hanging), 200)[0]
+        one, other = (BODY.positions(state, BODY.landmarks)[wrist] for state in (found, truth))
+        assert np.linalg.norm(one - other) < 0.05
+
+
+def test_a_lost_limb_needs_less(search):
+    wrong = turned(TRUTH, arm_add_l=-80, elbow_flex_l=60)
+    for lost, least in ((segments("forearm_l"), MIN_LOST_GAIN), (segments("forearm_r"), LEAP)):
+        found = find_limbs(search, wrong, segments("forearm_l", "upperarm_l"), lost)
+        assert least in {one for _, one in found}
+        assert {one for _, one in found} <= {MIN_GAIN, least}
+
+
 def test_a_trunk_that_is_sought_is_no_limb(search):
-    for state, least in find_limbs(search, TRUTH, segments("thorax"), tries=10):
+    for state, least in find_limbs(search, TRUTH, segments("thorax"), segments(), tries=10):
         assert search.score.of(state) > search.score.of(TRUTH) + least
 
 

@@ -8,6 +8,7 @@ from tests.tracking.depth_oracle import ARMS, BODY, UP, camera, depth_of, facing
 
 from kinefit.errors import BodyError, ObservationError, TrackingError
 from kinefit.images.depth import to_points
+from kinefit.initialization import from_depth
 from kinefit.initialization.from_depth import StartSearch, start_from_points
 from kinefit.rendering import render_body
 from kinefit.simulation.figures import in_front
@@ -85,6 +86,22 @@ def test_points_alone_do_and_the_same_seed_gives_the_same():
     one, other = (start_from_points(BODY, points, CAMERA, up=UP, search=StartSearch(count=1))[0] for _ in range(2))
     assert np.array_equal(one.state.angles, other.state.angles)
     assert np.mean(np.linalg.norm(joints(one.state) - joints(STATE), axis=1) < 0.1) >= 0.8
+
+
+def test_a_body_far_off_in_size_is_sized_from_all_images_that_it_explains_alike(monkeypatch):
+    used = []
+
+    def fit(body, clouds, states, **_):
+        used.append(len(clouds))
+        raise ObservationError("enough")
+
+    monkeypatch.setattr(from_depth, "fit_surfaces", fit)
+    small = BODY.scaled(np.full(len(BODY.scale_groups), 0.6))
+    scores = [start_from_points(small, None, CAMERA, d, up=UP)[0].score for d in (DEPTH, DEPTH[:, ::-1])]
+    assert max(scores) < from_depth._MIN_SIZE_SCORE
+    with pytest.raises(ObservationError, match="enough"):
+        from_depth.sized_start(small, [DEPTH, DEPTH[:, ::-1]], CAMERA, up=UP)
+    assert used == [2]
 
 
 @pytest.mark.parametrize(

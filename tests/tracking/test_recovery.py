@@ -74,3 +74,16 @@ def test_a_guess_is_taken_where_more_speaks_for_it(monkeypatch):
         result = tracker.update([depth_frame(0)], guess=guess)
         off = np.linalg.norm(result.state.T_world_root[:3, 3] - away.T_world_root[:3, 3])
         assert (off < 0.05) == found
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_starts_in_one_place_the_view_decides_and_not_the_number_of_segments_seen(monkeypatch, order):
+    truth = a_motion().state(5)
+    root = np.array(truth.T_world_root)
+    root[:3, :3] = np.diag([-1.0, 1.0, -1.0]) @ root[:3, :3]
+    away = replace(truth, T_world_root=root)
+    monkeypatch.setattr(recovery, "starts_from_views", lambda *_, **__: [[truth, away][::order]])
+    monkeypatch.setattr(recovery, "_better", lambda new, _: new.state.T_world_root[0, 0] * facing < 0.0)
+    facing = truth.T_world_root[0, 0]
+    result = Tracker(a_motion().body, a_rig(), rate=30.0, up="y").update([depth_frame(5)])
+    assert result.state.T_world_root[:3, 0] @ truth.T_world_root[:3, 0] > 0.9

@@ -30,7 +30,8 @@ from kinefit.sensors.visibility.occlusion import without_others
 from kinefit.solvers.least_squares import levenberg_marquardt
 
 MIN_GAIN = 0.01  # of the score (share of the person's pixels) by which another pose must be better
-LEAP = 0.05  # the same for a limb that moves elsewhere: about the share of a forearm
+LEAP = 0.05  # the same for a limb that moves elsewhere: about the share of a forearm ...
+MIN_LOST_GAIN = 0.02  # ... or of a hand, where the limb is lost: nothing speaks for its place
 
 
 def starts_from_points(
@@ -105,27 +106,31 @@ def known_points(measurements: Sequence[Measurement], scene: Scene) -> tuple[Poi
 
 
 def find_limbs(
-    search: PostureSearch, state: BodyState, seek: NDArray, tries: int = 200
+    search: PostureSearch, state: BodyState, seek: NDArray, lost: NDArray, tries: int = 200
 ) -> list[tuple[BodyState, float]]:
     """Search a view for better poses of some limbs: states with the gain in score that each must exceed.
 
-    First the limbs, then the whole body are moved locally. A limb found elsewhere must gain `LEAP`.
+    First the limbs, then the whole body are moved locally. A limb found elsewhere must gain `LEAP`,
+    a lost one `MIN_LOST_GAIN`.
 
     Parameters
     ----------
-    seek : (S,) bool, segments whose whole limbs are searched
+    seek, lost : (S,) bool, segments whose whole limbs are searched, and those of them that are lost
     tries : number of random poses per limb
     """
     current_score, ends = search.score.of(state), search.ends(state)
-    sought = [limb for limb in search.limbs if seek[list(limb)].any()]
+    is_lost = [bool(lost[list(limb)].any()) for limb in search.limbs]
     limb_dofs = np.flatnonzero(dofs_of_limbs(search.body, seek))
     near, value = search.polish(state, None, limb_dofs, 6, 48, 1.5) if len(limb_dofs) else (state, float(current_score))
     whole, whole_value = search.polish(near, None, np.arange(search.body.tree.n_dofs), 8, 40, 0.6)
     out = [(near, value - current_score, MIN_GAIN), (whole, whole_value - current_score, MIN_GAIN)]
     found = [(state, current_score)]
-    for limb in sought:
-        found = search.limb(found[0][0], limb, None, ends, tries)
-    out += [(s, v - current_score, LEAP) for s, v in found[:2]]
+    for least, of_lost in ((MIN_LOST_GAIN, True), (LEAP, False)):
+        sought = [limb for limb, one in zip(search.limbs, is_lost) if one == of_lost and seek[list(limb)].any()]
+        for limb in sought:
+            found = search.limb(found[0][0], limb, None, ends, tries)
+        if sought:
+            out += [(s, v - current_score, least) for s, v in found[:2]]
     return [(s, min_gain) for s, gain, min_gain in sorted(out, key=lambda o: o[2] - o[1]) if gain > min_gain]
 
 

@@ -27,6 +27,8 @@ YAWS = np.arange(0.0, 2 * np.pi, np.pi / 6)
 LEANS = ((0, 0), (20, 0), (45, 0), (-20, 0), (0, 20), (0, -20))  # [deg] forwards and sideways
 LIMB_TRIES = 200  # random poses of a limb in the refinement
 ROUGH_LIMB_TRIES = 100  # the same for each candidate of the trunk
+LIMB_CANDIDATES = 3  # of each kind, random and reaching, that are refined
+REACHING_STARTS = 3  # random poses of a limb for each end of the surface that it is to reach
 _MIN_LIMB_PIXELS = 4  # of a visible limb
 _MIN_UNEXPLAINED = 0.01  # of a person's pixels for a limb's end: a hand has 2 %
 STEP_SIGMAS = (0.04, 0.2, 0.35)  # [m, rad, rad] initial random steps of the root's position and rotation, and of angles
@@ -177,8 +179,9 @@ class PostureSearch:
     ) -> list[tuple[BodyState, float]]:
         """The best poses of one limb with everything else fixed, and their scores.
 
-        Candidates are random poses, and poses that bring the tip or fist to an end of the surface. A rough search
-        (fewer than `LIMB_TRIES`) has no closest-point fit.
+        Candidates are random poses, and poses that bring the tip or fist to an end of the surface. The best of either
+        kind are refined: random poses may be hidden behind the trunk, which contradicts nothing. A rough search (fewer
+        than `LIMB_TRIES`) has no closest-point fit.
 
         Parameters
         ----------
@@ -195,12 +198,17 @@ class PostureSearch:
         near_mean = self.rng.normal(tree.usual[d], np.minimum(prior_sigmas(self.body)[d], 0.6), size=(count, len(d)))
         angles = np.repeat(state.angles[None], 1 + count, axis=0)
         angles[1:, d] = np.clip(np.where(self.rng.random((count, 1)) < 0.35, near_mean, anywhere), low, high)
-        angles = np.concatenate([angles, self._reaching(state, limb, ends)])
+        angles = np.concatenate([angles, self._reaching(state, limb, np.tile(ends, (REACHING_STARTS, 1)))])
         drawn = tuple(range(len(tree.segments))) if drawn is None else drawn
         other_segments = tuple(s for s in drawn if s not in limb)
         held: dict[str, Any] = {"moving": limb, "base": self.score.depth(state, other_segments)}
         values = self.score(np.repeat(state.T_world_root[None], len(angles), axis=0), angles, drawn, **held)
-        best = [BodyState(state.T_world_root, angles[k]) for k in np.argsort(-values)[:4]]
+        reaching = np.arange(len(angles)) > count
+        best = [
+            BodyState(state.T_world_root, angles[k])
+            for kind in (np.flatnonzero(~reaching), np.flatnonzero(reaching))
+            for k in kind[np.argsort(-values[kind])[:LIMB_CANDIDATES]]
+        ]
         rough = sorted((self.polish(s, drawn, dofs, 3, 24, **held) for s in best), key=lambda b: -b[1])
         locked = np.ones(tree.n_dofs, bool)
         locked[dofs] = False

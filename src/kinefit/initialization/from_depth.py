@@ -28,7 +28,8 @@ _JOINING_GAPS = (0.15, 0.075)  # [m] for `people`: forearms towards the sensor a
 _MIN_SAME_OVERLAP = 0.65  # of two masks of one person: an upper body without both arms keeps 0.7 (rule of nines)
 _MAX_WALL_DEVIATION = 0.015  # [m] from a plane; a person who faces the sensor, arms down, has 0.02 or more
 _MIN_GOOD_SCORE = 0.7  # needs no second attempt: right poses of rendered bodies have 0.73 to 0.9
-_MIN_SIZE_SCORE = 0.55  # of a pose for sizing, by a body of another size
+_MIN_SIZE_SCORE = 0.55  # of a pose for sizing, by a body of another size ...
+_SIZE_SCORE_MARGIN = 0.15  # ... or within this of the best: a body far off in size explains every image poorly
 _MAX_BLOBS = 3  # largest objects in view that are tried
 _MIN_POINTS = 60  # a person 7.5 m from a camera of 160 x 124 pixels has several hundred
 
@@ -175,7 +176,7 @@ def sized_start(
         search, state = max(candidates, key=lambda t: _person_score(*t))
         found.append((search.view, state))
         scores.append(search.value(state))
-    used = [k for k, score in enumerate(scores) if score > min(_MIN_SIZE_SCORE, max(scores) - 1e-9)]
+    used = [k for k, score in enumerate(scores) if score > min(_MIN_SIZE_SCORE, max(scores) - _SIZE_SCORE_MARGIN)]
     views = [view for view, _ in found]
     states = [state for _, state in found]
     mean: NDArray | None = None

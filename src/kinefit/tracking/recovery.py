@@ -185,6 +185,7 @@ class Recovery:
         elapsed = abs(time - self._good[0])
         known = self._root if elapsed <= _TURN + 1e-6 else None
         here = None if result is None or _astray(result, self.settings.poor) else result.state.T_world_root
+        began = result
         for states in starts_from_views(
             scene, frames, self.up, own.measurements(frames, scene, points=True),
             backgrounds=own.stated, forward=None if known is None else known[:3, 0],
@@ -198,13 +199,29 @@ class Recovery:
                 found = tracker.fitted(time, frames, state).result
                 poor = _astray(found, self.settings.poor)
                 allowed = not poor if result is None else not poor or _astray(result, self.settings.poor)
-                if allowed and (result is None or _better(found, result) or _explains(search, found, result)):
+                if allowed and self._preferred(tracker, found, result, began, search):
                     result, self._lost_since = found, time
                     tracker.restart(found)
             if result is not None and not _astray(result, self.settings.poor):
                 if search is None or search.score.missing(result.state) <= LEAP:
                     break  # another attempt costs as much
         return result
+
+    def _preferred(
+        self, tracker: Searching, new: FrameResult, old: FrameResult | None, began: FrameResult | None,
+        search: PostureSearch | None,
+    ) -> bool:  # fmt: skip
+        """Whether a start is taken in place of what was tracked, or of another start: of these the view decides.
+
+        A body that faces away from the sensor shows as many segments as one that faces it.
+        """
+        if old is None or old is began:
+            return old is None or _better(new, old) or _explains(search, new, old)
+        view = self._search(tracker, old.time, old.measurements, old)
+        if view is None or _gone(new.state.T_world_root, old.state.T_world_root) > _STRIDE:
+            return _better(new, old)
+        values = [view.value(r.state) - LEAP * _against(tracker, r) for r in (new, old)]
+        return values[0] > values[1]
 
     def _limbs(
         self, tracker: Searching, time: float, frames: Sequence[Any], search: PostureSearch, result: FrameResult,
@@ -214,7 +231,7 @@ class Recovery:
         std = np.minimum(result.dof_std, np.where(np.arange(len(free)) < 6, ROOT_PRIOR_STD, np.pi))
         held = result.state, marginal_information(inverse(np.diag(std**2)), free)
         now = best = search.score.of(result.state) - LEAP * _against(tracker, result)
-        for state, least in find_limbs(search, result.state, seek):
+        for state, least in find_limbs(search, result.state, seek, lost):
             found = tracker.fitted(time, frames, state, held).result
             value = search.score.of(found.state) - LEAP * _against(tracker, found)
             if not self._shown(tracker, found, lost):
@@ -234,13 +251,16 @@ class Recovery:
         return None if view is None else PostureSearch(self.body, view, self.up, np.random.default_rng(0))
 
     def _shown(self, tracker: Searching, found: FrameResult, seek: NDArray) -> bool:
-        """Whether the surfaces that were seen show what was found: else it would hide, and not be found."""
+        """Whether the surfaces show something of each limb that was found: else it would hide."""
         scene = tracker.scene_of(found.state, found.time)
         views = [m for m in found.matched if m.shows_surface]
         hidden = np.ones(len(seek), bool)
         for m in views:
             hidden &= m.evidence(scene).hidden
-        return not (hidden & seek).any()
+        parts = limbs(self.body)
+        sought = [list(limb) for limb in parts if seek[list(limb)].any()]
+        trunk = np.isin(np.arange(len(seek)), [s for limb in parts for s in limb], invert=True)
+        return not (hidden & seek & trunk).any() and not any(hidden[limb].all() for limb in sought)
 
     def _leap(self, time: float, old: FrameResult, new: FrameResult, seek: NDArray) -> float:
         """How much faster than a brisk wave a limb would have moved since it was last seen where it was, 1 at least."""

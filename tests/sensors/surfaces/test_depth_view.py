@@ -56,8 +56,23 @@ def test_distance_outside_the_outline():
         x_camera = np.array([[right + beyond, 0.0, 2.0], [0.0, 0.0, 2.0]])
         x = x_camera @ CAMERA.T_world_camera[:3, :3].T + CAMERA.centre_world
         gap, trust = outside(view, x)
-        assert abs(gap[0] - beyond) < 0.025 and gap[1] == 0.0  # a pixel of the view
-        assert trust[0] == UNMEASURED_TRUST
+        assert abs(gap[0] - beyond) < 0.025 and abs(gap[1] + right) < 0.025  # a pixel of the view
+        assert trust[0] == UNMEASURED_TRUST and trust[1] == 1.0
+    x_camera = np.array([[right - 0.05, 0.0, 2.0], [right - 0.05, 0.0, 2.3]])
+    gap, trust = outside(view, x_camera @ CAMERA.T_world_camera[:3, :3].T + CAMERA.centre_world)
+    assert abs(gap[0] + 0.05) < 0.025 and trust.tolist() == [1.0, 0.0]  # the second is measured nearer
+
+
+def test_an_object_in_front_of_a_person_is_no_contour():
+    person, covered = np.zeros((2, 240, 320), bool)
+    person[60:180, 100:200], covered[60:180, 200:230] = True, True
+    right = (199 - CAMERA.matrix[0, 2]) / 288.0 * 2.0
+    x = np.array([[right - 0.05, 0.0, 2.0]]) @ CAMERA.T_world_camera[:3, :3].T + CAMERA.centre_world
+    gaps = []
+    for z in (1.0, 3.0):
+        depth = np.where(covered, z, flat(person))
+        gaps.append(outside(view_of(depth, person, CAMERA), x)[0][0])
+    assert gaps[0] < -0.15 and abs(gaps[1] + 0.05) < 0.025
 
 
 def test_ends_of_a_cross_and_of_a_part_that_is_torn_off():

@@ -171,9 +171,10 @@ def _bridge(points: NDArray, seen: NDArray, distance: NDArray) -> None:
 
 
 def outside(view: DepthView, x_world: NDArray) -> tuple[NDArray, NDArray]:
-    """Distance of points (N, 3) [m] outside the person's contour, (N,) [m] across the line of sight; 0 inside.
+    """Distance of points (N, 3) [m] from the person's contour, (N,) [m] across the line of sight; negative inside it.
 
-    And its confidence, (N,) in 0..1: 0 outside the sensor's image and behind other objects.
+    And its confidence, (N,) in 0..1: 0 outside the sensor's image, behind other objects, and inside where the person is
+    measured at another depth. The edge of the image and other objects in front of the person are no contour.
     """
     x = x_world @ view.T_view_world[:3, :3].T + view.T_view_world[:3, 3]
     z = np.maximum(x[:, 2], 1e-3)
@@ -181,10 +182,14 @@ def outside(view: DepthView, x_world: NDArray) -> tuple[NDArray, NDArray]:
     h, w = view.observed.shape
     inside = (x[:, 2] > 1e-3) & (column >= 0) & (column < w) & (row >= 0) & (row < h)
     column, row = np.where(inside, column, 0), np.where(inside, row, 0)
-    gap = cv2.distanceTransform((~view.seen).astype(np.uint8), cv2.DIST_L2, 3)[row, column]
+    empty = ~view.seen & (view.trust > 0.0) & (view.behind > np.median(view.observed[view.seen]))
+    gap, depth = (cv2.distanceTransform(a.astype(np.uint8), cv2.DIST_L2, 3)[row, column] for a in (~view.seen, ~empty))
     trust = np.where(inside & (x[:, 2] < view.behind[row, column]), view.trust[row, column], 0.0)
+    within = view.seen[row, column]
+    agrees = inside & (np.abs(view.observed[row, column] - x[:, 2]) < _MAX_NEIGHBOUR_DISTANCE)
     # the contour runs half a pixel before the first pixel without the person
-    return np.maximum(gap - 0.5, 0.0) * z / view.lens[0], trust
+    distance = np.where(within, 0.5 - depth, np.maximum(gap - 0.5, 0.0)) * z / view.lens[0]
+    return distance, np.where(within, agrees, trust)
 
 
 def camera_at(x_world: NDArray, viewpoint: NDArray | None) -> Camera:
