@@ -24,7 +24,8 @@ _MIN_HEIGHT_PX = 200  # of a person: pose detectors scale people to about this
 _TURN_RANGE = np.radians(1.5), np.radians(15.0)  # of a camera that was moved; calibrated ones: up to 0.7 degrees
 _TURN_ROUNDS = 25  # of reweighted least squares
 _MAX_TURNED_ERROR = 0.15  # after the rotation, as a share of the limit: a detector's noise is 0.07
-_MAX_OTHER_RATIO = 0.92  # of that error to the other camera's: about the vertical, both rotations leave nearly the same
+_MIN_TURN_GAIN = 2.0  # of the error before to that after: up to 1.5 in pairs of real cameras as calibrated
+_MAX_OTHER_RATIO = 0.85  # of that error to the other camera's: about the vertical, both rotations leave nearly the same
 _MIN_SINE = 0.15  # of the angle between ray and baseline
 _MIN_TURN_POINTS = 100  # in both images
 _GRID_CELLS = 6  # of the volume along each axis, for a camera's coverage
@@ -157,10 +158,12 @@ def turned_cameras(views: KeypointViews) -> tuple[Camera, ...]:
     (error, angle, camera), (other_error, _, other) = sorted((_turned(views, c) for c in (0, 1)), key=lambda f: f[0])
     if not (error < _MAX_TURNED_ERROR * views.limit and _TURN_RANGE[0] < angle < _TURN_RANGE[1]):
         return ()
+    if min(_turned(views, c, rounds=0)[0] for c in (0, 1)) < _MIN_TURN_GAIN * error:
+        return ()
     return (camera,) if error < _MAX_OTHER_RATIO * other_error else (camera, other)
 
 
-def _turned(views: KeypointViews, c: int) -> tuple[float, float, Camera]:
+def _turned(views: KeypointViews, c: int, rounds: int = _TURN_ROUNDS) -> tuple[float, float, Camera]:
     """Median epipolar error [px] after the rotation [rad] of a camera about itself that fits the other's rays best."""
     own, other = views.rig.cameras[c], views.rig.cameras[1 - c]
     rays, others = (camera.ray(uv) for camera, uv in zip((own, other), np.moveaxis(views.pixels(), 1, 0)[[c, 1 - c]]))
@@ -172,7 +175,7 @@ def _turned(views: KeypointViews, c: int) -> tuple[float, float, Camera]:
         return np.inf, 0.0, own
     rays, normals, R = rays[known], (normals / sines)[known], np.eye(3)
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    for _ in range(_TURN_ROUNDS):
+    for _ in range(rounds):
         there = rays @ R.T
         off = np.sum(normals * there, axis=1)
         weight = 1.0 / (1.0 + np.square(off / (2.0 * np.median(np.abs(off)) + 1e-12)))
