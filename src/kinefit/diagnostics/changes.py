@@ -8,7 +8,7 @@ those of the others.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -244,15 +244,20 @@ def shifted(views: KeypointViews, delays: Sequence[float] | NDArray) -> Keypoint
     return replace(views, uv=uv)
 
 
-def move_findings(views: KeypointViews, frames: NDArray) -> tuple[list[Finding], KeypointViews]:
+def move_findings(
+    views: KeypointViews, frames: NDArray, ignored: Collection[str] = ()
+) -> tuple[list[Finding], KeypointViews]:
     """Faults for cameras that moved during the recording, and the views without what they saw in their other pose.
 
     Parameters
     ----------
     views : KeypointViews of three cameras or more
     frames : (F,) int, the numbers of the take's frames
+    ignored : cameras that lack frames, whose absence would shift the points of the others
     """
     out, rest, uv = list[Finding](), views, views.uv.copy()
+    for name in ignored:
+        rest = rest.without(rest.rig.index(name))
     while len(rest.rig) > 2:
         moves = [_largest_step(_offsets(rest, c)) for c in range(len(rest.rig))]
         without = [rest.without(c) if move[0] >= _MIN_MOVE_PX else None for c, move in enumerate(moves)]

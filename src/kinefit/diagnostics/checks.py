@@ -302,7 +302,8 @@ def _moved_within(c: Checked) -> list[Finding]:
     if c.quick and c.frames_late:  # the views are of an interval
         return []
     every = -(-min(map(len, c.keypoints)) // len(c.views)) if c.quick else 1
-    found, seen = changes.move_findings(c.views, _first_frame(c) + every * np.arange(len(c.views)))
+    frames, still = _first_frame(c) + every * np.arange(len(c.views)), _named(c, "frozen")
+    found, seen = changes.move_findings(c.views, frames, still & {*c.views.rig.names})
     if found:
         c.views, c.moving = seen, c.moving if c.quick else seen
         _synchronise(c, c.views.rig.names)
