@@ -48,6 +48,7 @@ BENCHMARKS = {
     "recipe_regions.png": "python -m benchmarks.recipe_pictures",
     "regions_cyclist.jpg": "python -m benchmarks.regions regions_gear",
     "regions_cyclist.svg": "python -m benchmarks.regions regions_gear",
+    "regions_jump.jpg": "python -m benchmarks.regions regions_jumps",
     "regions_snowboarder.jpg": "python -m benchmarks.regions regions_gear",
     "regions_snowboarder.svg": "python -m benchmarks.regions regions_gear",
     "regions_snowboarder_feet.svg": "python -m benchmarks.regions regions_gear",

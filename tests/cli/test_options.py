@@ -123,7 +123,7 @@ def acts_or_is_refused(make, usual):
 HEAD = {
     "name": 'name = "another"', "rate": "rate = 5.0", "up": 'up = "x"', "body": 'body = "humanoid39"',
     "height": "height = 1.3", "subject": 'subject = "take.toml"', "start": 'start = "other.npz"',
-    "frames": "frames = [0, 4]", "size": "size = false", "person": "person = 2",
+    "frames": "frames = [0, 4]", "size": "size = false", "person": "person = 2", "bands": "bands = { neck = 0.01 }",
 }  # fmt: skip
 OWN = {
     "keypoints": {

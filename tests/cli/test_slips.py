@@ -188,7 +188,8 @@ def test_a_folder_of_results_stands_for_the_motion_in_it(tmp_path):
 @pytest.mark.parametrize(
     ("words", "told"),
     [(("calibrate", "baar"), "Did you mean 'bar'?"), (("markers", "ident"), "Did you mean 'identify'?"),
-     (("body", "xyz"), "There are: check, copy, picture."), (("calibrate", "bar", "x"), "'--length'. Give --length M."),
+     (("body", "xyz"), "There are: check, copy, picture, refine."),
+     (("calibrate", "bar", "x"), "'--length'. Give --length M."),
      (("calibrate", "bar", "--length", "1"), "'VIDEO_FOLDER_OR_CSV...'.")],
 )  # fmt: skip
 def test_commands_of_a_group_are_told(words, told):

@@ -47,6 +47,7 @@ NOT_RUN = {
     ("sensors", "kinefit track"): "a minute; the robot's tutorial does it with ten images",
     ("simulate", "kinefit track"): "the same",
     ("which-setup", "kinefit track"): "the same",
+    ("view", "kinefit replay my_take-kinefit"): "needs a video; tests/simulation/test_replay.py draws beside one",
     ("recipes/voodoo", "kinefit evaluate"): "minutes to an hour; tests/evaluation/test_experiment.py runs a part",
 }
 """{(page, how a line begins): why it is not run}; of `install`, `one-camera` and `telephones` nothing is."""

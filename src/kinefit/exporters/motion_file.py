@@ -84,7 +84,7 @@ def _write(path: str | PathLike[str], kind: str, form: Any, arrays: Mapping[str,
         for key, value in whole.items():  # as numpy.savez_compressed, which would have all in memory at once
             array = np.asarray(value)
             with file.open(f"{key}.npy", "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, array, allow_pickle=False)
+                np.lib.format.write_array(entry, array)
             release(array)
 
 
