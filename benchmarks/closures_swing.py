@@ -30,7 +30,7 @@ PRIORS = {  # [m, rad] standard deviations of body.toml
     "club length": 0.10, "hand distance": 0.03, "shaft angle": np.radians(15.0), "shaft sideways": np.radians(15.0),
     "face angle": np.radians(25.0),
 }  # fmt: skip
-OBSERVED = ("club length",)  # no marker is on a hand: the palms' direction is left to the prior of the wrists
+OBSERVED = "club length", "hand distance"  # the shaft's angles in the hand look like a bent wrist
 _OTHER_MEANS = 0.80, 1.00  # [m] of the club's length
 
 

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit._mapped import release, room
 
-_KEYS_AT_ONCE = 1000  # of long takes: their factors fill 11 kB a key frame
+KEYS_AT_ONCE = 1000
+"""Key frames of which factors, 11 kB each, are in memory at once."""
 _KEY_FRAMES_PER_S = 20.0  # The sigma of differences on the balancing trial is within 2.6 % of that with every frame,
 # 0.5 % for nine tenths; with 10 a second within 8 %.
 
@@ -154,8 +155,8 @@ class LastingErrors:
 def _turned(factors: NDArray, R: NDArray) -> NDArray:
     """Factors (K, 6 + D, k), of the same type, in a world that R (3, 3) turns the old one into."""
     out = room(factors.shape, factors.dtype)
-    for start in range(0, len(out), _KEYS_AT_ONCE):
-        some = slice(start, start + _KEYS_AT_ONCE)
+    for start in range(0, len(out), KEYS_AT_ONCE):
+        some = slice(start, start + KEYS_AT_ONCE)
         out[some] = factors[some]
         out[some, :3], out[some, 3:6] = R @ factors[some, :3], R @ factors[some, 3:6]
         release(out, factors)

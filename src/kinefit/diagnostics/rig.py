@@ -155,16 +155,19 @@ def turned_cameras(views: KeypointViews) -> tuple[Camera, ...]:
     """
     if len(views.rig) != 2:
         return ()
-    (error, angle, camera), (other_error, _, other) = sorted((_turned(views, c) for c in (0, 1)), key=lambda f: f[0])
-    if not (error < _MAX_TURNED_ERROR * views.limit and _TURN_RANGE[0] < angle < _TURN_RANGE[1]):
-        return ()
-    if min(_turned(views, c, rounds=0)[0] for c in (0, 1)) < _MIN_TURN_GAIN * error:
+    found = sorted((_turned(views, c) for c in (0, 1)), key=lambda one: one[0])
+    (error, _, angle, camera), (other_error, _, _, other) = found
+    is_near = error < _MAX_TURNED_ERROR * views.limit and _TURN_RANGE[0] < angle < _TURN_RANGE[1]
+    if not is_near or min(before for _, before, _, _ in found) < _MIN_TURN_GAIN * error:
         return ()
     return (camera,) if error < _MAX_OTHER_RATIO * other_error else (camera, other)
 
 
-def _turned(views: KeypointViews, c: int, rounds: int = _TURN_ROUNDS) -> tuple[float, float, Camera]:
-    """Median epipolar error [px] after the rotation [rad] of a camera about itself that fits the other's rays best."""
+def _turned(views: KeypointViews, c: int) -> tuple[float, float, float, Camera]:
+    """Median epipolar errors [px] after and before the rotation of a camera about itself that fits the other's rays.
+
+    And its angle [rad], and the camera as it then stands.
+    """
     own, other = views.rig.cameras[c], views.rig.cameras[1 - c]
     rays, others = (camera.ray(uv) for camera, uv in zip((own, other), np.moveaxis(views.pixels(), 1, 0)[[c, 1 - c]]))
     base = other.centre_world - own.centre_world
@@ -172,18 +175,19 @@ def _turned(views: KeypointViews, c: int, rounds: int = _TURN_ROUNDS) -> tuple[f
     sines = np.linalg.norm(normals, axis=1, keepdims=True)
     known = np.isfinite(rays + normals).all(axis=1) & (sines[:, 0] > _MIN_SINE * np.linalg.norm(others, axis=1))
     if known.sum() < _MIN_TURN_POINTS:
-        return np.inf, 0.0, own
+        return np.inf, np.inf, 0.0, own
     rays, normals, R = rays[known], (normals / sines)[known], np.eye(3)
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    for _ in range(rounds):
+    for _ in range(_TURN_ROUNDS):
         there = rays @ R.T
         off = np.sum(normals * there, axis=1)
         weight = 1.0 / (1.0 + np.square(off / (2.0 * np.median(np.abs(off)) + 1e-12)))
         step = np.linalg.lstsq(weight[:, None] * np.cross(there, normals), -weight * off, rcond=None)[0]
         R = se3.exp_so3(step) @ R
     T_world = se3.transform(R, own.centre_world - R @ own.centre_world)
-    error = own.matrix[0, 0] * float(np.median(np.abs(np.sum(normals * (rays @ R.T), axis=1))))
-    return error, float(np.linalg.norm(se3.log_so3(R))), own.with_pose(own.T_camera_world @ se3.inverse(T_world))
+    errors = [own.matrix[0, 0] * float(np.median(np.abs(np.sum(normals * x, axis=1)))) for x in (rays @ R.T, rays)]
+    angle = float(np.linalg.norm(se3.log_so3(R)))
+    return errors[0], errors[1], angle, own.with_pose(own.T_camera_world @ se3.inverse(T_world))
 
 
 def turn_findings(views: KeypointViews) -> tuple[list[Finding], KeypointViews]:

@@ -17,7 +17,7 @@ from kinefit._arguments import checked
 from kinefit._files import LENGTHS, write_bytes, write_text
 from kinefit.errors import ExportError
 from kinefit.exporters.opensim import trc_head
-from kinefit.exporters.report.cycles import find_cycles
+from kinefit.exporters.report.cycles import find_gait
 from kinefit.exporters.skeletons.common import UNITS, bone_names, convention, length_factor, plain_names, turned
 from kinefit.exporters.tables import Curve, curves
 from kinefit.motion import Motion
@@ -182,8 +182,8 @@ def write_c3d(
         },
         "ANALOG": {"USED": np.array(0, np.uint16), "RATE": np.array(motion.rate, np.float32), "LABELS": []},
     }  # fmt: skip
-    if cycles := find_cycles(motion):
-        groups["EVENT"] = _events(cycles.events)
+    if gait := find_gait(motion):
+        groups["EVENT"] = _events(gait.events)
     write_bytes(path, c3d_bytes(points, fourth, groups, scale=-1.0, rate=motion.rate, first=first))
 
 

@@ -285,7 +285,7 @@ class _Search:
             if found is None and cost_k > _MAX_LONE_VIEW_ERROR:
                 unseen = [x for own, x in seen if kept[0][0] not in {q for q, _ in own}]
                 if any(_distance(expected[k], x) < 2.0 * MAX_STEP for x in unseen):
-                    continue  # it may be of somebody near whom this camera does not see
+                    continue  # it may be of another person nearby, unseen by this camera
             updates.append((found is None, gap, cost_k, k, kept, found))
         for _, _, _, k, kept, found in sorted(updates, key=lambda one: one[:4]):
             new = accepted[len(others) :]

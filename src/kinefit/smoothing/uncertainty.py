@@ -25,7 +25,7 @@ from kinefit.bodies import Body, BodyState, KinematicTree
 from kinefit.correspondences import _kernels, targets
 from kinefit.correspondences.closures import closed_at
 from kinefit.frame.results import FrameResult
-from kinefit.lasting_errors import LastingErrors, ParameterErrors, key_frames
+from kinefit.lasting_errors import KEYS_AT_ONCE, LastingErrors, ParameterErrors, key_frames
 from kinefit.rows import Rows
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.points.keypoints import Layout
@@ -51,7 +51,6 @@ MOTION_CORRELATION_TIME = 0.1
 
 _BY_MEASUREMENTS = 0.8  # of a smoothed fit's variance, by errors of measurements, the rest by accelerations. 0.78 to
 # 0.83 by the spectrum of a motion prior that averages 0.2 s, at 30 to 100 Hz, with accelerations of 0.05 to 0.3 s
-_KEPT_AT_ONCE = 1000  # key frames, of which lasting errors fill 11 kB each
 _LARGEST = 6e4  # [m, rad] of what is kept, which 16 bits hold: of what nothing observes
 _DIRECTIONS = 120  # of lasting errors that are kept. The sigma of differences on the balancing trial is within 0.3 %
 # of that with all; with 60 within 6 %, with 20 within 43 %
@@ -218,7 +217,7 @@ class _KeyFrames:
             constant, drift = _with_shapes(errors, shapes, frame), errors.drift
             self.errors.constant[k] = np.clip(product(constant, self.constant), -_LARGEST, _LARGEST)
             self.errors.drift[k] = np.clip(product(drift, self.drift), -_LARGEST, _LARGEST)
-            if k % _KEPT_AT_ONCE == _KEPT_AT_ONCE - 1:
+            if (k + 1) % KEYS_AT_ONCE == 0:
                 release(self.errors.constant, self.errors.drift)
 
 

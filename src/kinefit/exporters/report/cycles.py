@@ -75,12 +75,12 @@ def find_cycles(motion: Motion) -> Cycles | None:
     """The cycles of a motion, None where it does not clearly repeat itself.
 
     Cycles last about as long (coefficient of variation at most 25 %) and look alike (coefficient of multiple
-    correlation at least 0.75). One stride is enough where the feet stand at both ends of it. Cycles in which nobody was
-    seen for a frame are left out.
+    correlation at least 0.75). One stride is enough where the feet stand at both ends of it. Cycles with a frame in
+    which no person was seen are left out.
     """
     if len(motion) < 3 or len(motion) / motion.rate < 2 * MIN_STRIDE_S:
         return None
-    return _gait(motion) or _repeated(motion)
+    return find_gait(motion) or _repeated(motion)
 
 
 def normalised(values: NDArray, spans: NDArray) -> NDArray:
@@ -123,21 +123,22 @@ def gait_numbers(motion: Motion, cycles: Cycles) -> dict[str, list[Quantity]]:
     return {name: [of.get(name, none) for of in found] for name in names}
 
 
-def _gait(motion: Motion) -> Cycles | None:
+def find_gait(motion: Motion) -> Cycles | None:
+    """The strides of a motion, as of `find_cycles`, None where it is no gait."""
     feet = foot_events(motion)
     if feet is None:
         return None
     sides, alike = [], []
     for foot in (feet.left, feet.right):
-        frames = np.interp(foot.contacts, motion.times, np.arange(len(motion)))
-        spans, exact = _usable(motion, np.rint(frames).astype(int)), set(frames[foot.contact_std < _EXACT_S].round())
+        frames = np.rint(np.interp(foot.contacts, motion.times, np.arange(len(motion)))).astype(int)
+        spans, exact = _usable(motion, frames), {*frames[foot.contact_std < _EXACT_S].tolist()}
         columns = [d for d, c in enumerate(motion.body.tree.coordinates) if c in [f"{g}_{foot.side[0]}" for g in _GAIT]]
         if not len(spans) or not columns or not _even(spans) or (len(spans) == 1 and not exact.issuperset(spans[0])):
             continue
         curves = normalised(np.unwrap(motion.angles[:, columns], axis=0), spans)
         if len(spans) > 1:
             alike.append(float(np.mean([likeness(curves[..., c]) for c in range(len(columns))])))
-        times = np.array([foot.contacts[[np.argmin(np.abs(frames - f)) for f in span]] for span in spans])
+        times = foot.contacts[np.searchsorted(frames, spans)]
         sides.append(Side(foot.side, spans, _toe_off(times, foot.offs), times))
     if min(alike, default=1.0) < _MIN_CORRELATION or not _alternate(feet.left.contacts, feet.right.contacts):
         return None

@@ -12,10 +12,11 @@ from kinefit.bodies import PointSet
 from kinefit.exporters.report.feet import BALL, HEEL, Feet, FootEvents
 from kinefit.motion import BRIEF_S, Motion, rotation_between_up
 
-TIMES = "stride time [s]", "cadence [steps/min]", "stance [% of cycle]", "swing [% of cycle]"
-STEPS = "double support [% of cycle]", "step time [s]"
-LENGTHS = "stride length [m]", "speed [m/s]", "step length [m]", "step width [m]", "foot progression [deg]"
-"""Quantities of a stride, which are those of the foot whose contacts begin and end it."""
+_QUANTITIES = (
+    "stride time [s]", "cadence [steps/min]", "stance [% of cycle]", "swing [% of cycle]",
+    "double support [% of cycle]", "step time [s]", "stride length [m]", "speed [m/s]",
+    "step length [m]", "step width [m]", "foot progression [deg]",
+)  # fmt: skip
 
 _LEAST_SHARE = 0.3  # of the stature, of a stride that goes anywhere: shorter ones have no direction
 
@@ -70,7 +71,7 @@ def stride_quantities(motion: Motion, feet: Feet, side: str, times: NDArray) -> 
     """
     own, other = (feet.left, feet.right) if side == "left" else (feet.right, feet.left)
     rows = [_stride(motion, feet.belt, own, other, float(start), float(stop)) for start, stop in times]
-    table = {name: np.array([row.get(name, (np.nan, np.nan)) for row in rows]) for name in (*TIMES, *STEPS, *LENGTHS)}
+    table = {name: np.array([row.get(name, (np.nan, np.nan)) for row in rows]) for name in _QUANTITIES}
     return {name: Quantity(*pairs.T) for name, pairs in table.items() if np.isfinite(pairs[:, 0]).any()}
 
 
@@ -96,8 +97,8 @@ def _stride(
         out["double support [% of cycle]"] = both, error
     out |= _lengths(motion, belt, own.side[0], start, stop, landed and landed[0], first and first[0])
     if "stride length [m]" in out:
-        way, error = out["stride length [m]"]
-        out["speed [m/s]"] = way / length, float(np.hypot(error, std * way / length) / length)
+        gone, error = out["stride length [m]"]
+        out["speed [m/s]"] = gone / length, float(np.hypot(error, std * gone / length) / length)
     return out
 
 
@@ -111,31 +112,31 @@ def _lengths(
     motion: Motion, belt: NDArray, side: str, start: float, stop: float, landed: float | None, off: float | None
 ) -> dict[str, tuple[float, float]]:
     """Of a stride of foot "l" or "r", in which the other one lands and this one leaves the ground at times [s]."""
-    way, settled = _Ground(motion, belt), _SETTLED * (stop - start)
-    begin, end = (way.frame(t + settled) for t in (start, stop))
+    ground, settled = _Ground(motion, belt), _SETTLED * (stop - start)
+    begin, end = (ground.frame(t + settled) for t in (start, stop))
     heel, opposite = f"{side}_{HEEL}", f"{'r' if side == 'l' else 'l'}_{HEEL}"
     stride: list[Term] = [(heel, end, 1.0), (heel, begin, -1.0)]
-    moved = way.sum_of(stride)
+    moved = ground.sum_of(stride)
     length = float(np.linalg.norm(moved))
     if length < _LEAST_SHARE * (motion.body.stature or 1.7):
         return {}
     along = moved / length
     right = np.array([-along[1], along[0]])  # y is up: of x ahead, z is to the right
-    out = {"stride length [m]": (length, way.std_of(stride, along))}
+    out = {"stride length [m]": (length, ground.std_of(stride, along))}
     if landed is not None:
-        at = way.frame(landed + settled)
+        at = ground.frame(landed + settled)
         step: list[Term] = [(heel, end, 1.0), (opposite, at, -1.0)]
-        gone = float(way.sum_of(step) @ along)
+        gone = float(ground.sum_of(step) @ along)
         share = 1.0 - gone / length  # of the stride, at which the other foot stands beside its line
         beside: list[Term] = [(opposite, at, 1.0), (heel, begin, share - 1.0), (heel, end, -share)]
         outward = right if side == "l" else -right
-        out["step length [m]"] = gone, way.std_of(step, along)
-        out["step width [m]"] = float(way.sum_of(beside) @ outward), way.std_of(beside, outward)
+        out["step length [m]"] = gone, ground.std_of(step, along)
+        out["step width [m]"] = float(ground.sum_of(beside) @ outward), ground.std_of(beside, outward)
     if off is not None:
-        middle = way.frame(0.5 * (start + off))
+        middle = ground.frame(0.5 * (start + off))
         foot: list[Term] = [*((f"{side}_{name}", middle, 0.5) for name in BALL), (heel, middle, -1.0)]
-        axis, outward = way.sum_of(foot), right if side == "r" else -right
-        turned, error = np.arctan2(axis @ outward, axis @ along), way.turn_std_of(foot, outward, axis)
+        axis, outward = ground.sum_of(foot), right if side == "r" else -right
+        turned, error = np.arctan2(axis @ outward, axis @ along), ground.turn_std_of(foot, outward, axis)
         out["foot progression [deg]"] = float(np.degrees(turned)), float(np.degrees(error))
     return out
 
@@ -160,7 +161,7 @@ class _Ground:
     def std_of(self, terms: Sequence[Term], direction: NDArray) -> float:
         """[m] standard deviation of that sum along a direction (2,).
 
-        Of a place in one frame it is that of the segment's joint; what frames and feet have in common is told by
+        Of a place in one frame it is that of the segment's joint; what frames and feet have in common follows from
         `LastingErrors`, and the rest of one foot by how far its frames are apart, as in `Motion.std_of`.
         """
         motion, count = self._motion, len(terms)
