@@ -9,9 +9,9 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
-from benchmarks.house import HOUSE_SIZE, all_lines, house_size, source_size
-from benchmarks.house_imports import circles, imported_modules, imported_names, module_name, parsed
-from benchmarks.house_record import lost
+from benchmarks.house.house_imports import circles, imported_modules, imported_names, module_name, parsed
+from benchmarks.house.house_record import lost
+from benchmarks.house.house_size import HOUSE_SIZE, all_lines, house_size, source_size
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "kinefit"
@@ -181,7 +181,7 @@ def test_the_house_does_not_grow(unit):
 
 
 def test_no_capability_is_lost():
-    assert not lost(), "\n".join([*lost(), "Bring it back, or list it in benchmarks/house_record.py with the reason."])
+    assert not lost(), "\n".join([*lost(), "Bring it back, or list it in benchmarks/house/house_record.py with the reason."])
 
 
 def public_without_docstring(body: list[ast.stmt], prefix: str = "") -> list[str]:

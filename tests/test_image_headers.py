@@ -8,8 +8,8 @@ import av
 import cv2
 import numpy as np
 import pytest
-from benchmarks.bags import Bag
-from benchmarks.faults_readers import _jpeg, _png
+from benchmarks.robustness.faults_readers import _jpeg, _png
+from benchmarks.scenes.bags import Bag
 
 from kinefit._image_headers import MAX_IMAGE_PIXELS, image_sizes
 from kinefit._pictures import read_picture

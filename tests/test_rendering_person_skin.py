@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.person_skin import skin
+from benchmarks.scenes.person_skin import skin
 
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh

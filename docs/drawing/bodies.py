@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
-from benchmarks.gear_takes import rendered_snowboarder
+from benchmarks.papers.regions.gear_takes import rendered_snowboarder
 from numpy.typing import NDArray
 from PIL import Image
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-from benchmarks.marker_takes import load
+from benchmarks.scenes.marker_takes import load
 from numpy.typing import NDArray
 
 from drawing import results

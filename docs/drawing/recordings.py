@@ -6,9 +6,9 @@ import shutil
 
 import cv2
 import numpy as np
-from benchmarks.bar_scene import bar_rig, draw_bar, wave_bar
-from benchmarks.curves import curves
-from benchmarks.silhouettes_track import take_text
+from benchmarks.accuracy.images.silhouettes_track import take_text
+from benchmarks.scenes.bar_scene import bar_rig, draw_bar, wave_bar
+from benchmarks.scenes.curves import curves
 from numpy.typing import NDArray
 
 from drawing import results

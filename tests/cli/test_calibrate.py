@@ -5,7 +5,7 @@ import csv
 import cv2
 import numpy as np
 import pytest
-from benchmarks.bar_scene import CORNERS, bar_rig, draw_bar, pose_differences, see_bar, wave_bar, write_corners
+from benchmarks.scenes.bar_scene import CORNERS, bar_rig, draw_bar, pose_differences, see_bar, wave_bar, write_corners
 from click.testing import CliRunner
 
 from kinefit.cli.calibrate import calibrate

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from benchmarks.bags import Bag
+from benchmarks.scenes.bags import Bag
 from click.testing import CliRunner
 
 from kinefit import read_motion

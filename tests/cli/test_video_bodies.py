@@ -1,7 +1,7 @@
 """From drawn videos and a bar recording to an animation, by the commands and clicked joints alone."""
 
 import pytest
-from benchmarks import video_bodies
+from benchmarks.accuracy.surfaces import video_bodies
 
 from kinefit.readers.motion import read_motion
 

@@ -6,7 +6,7 @@ from functools import cache
 
 import cv2
 import numpy as np
-from benchmarks.bar_scene import bar_rig, draw_bar, wave_bar
+from benchmarks.scenes.bar_scene import bar_rig, draw_bar, wave_bar
 from tests.calibration.board import test_calibrate as boards
 
 import kinefit

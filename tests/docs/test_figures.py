@@ -13,7 +13,7 @@ from benchmarks.figures import figure, holds
 from benchmarks.ledger import BEFORE, LOG, PAGE, Record, filled, read
 
 ROOT = Path(__file__).resolve().parents[2]
-RUN = "python -m benchmarks.solver solver"
+RUN = "python -m benchmarks solver solver"
 TABLE = """| figure | value | before | goal | | run |
 | --- | --- | --- | --- | --- | --- |
 | `speed`, of legs | 4.5 ms | 9 | ≤ 5 | met, narrowly | 2026-11-24 abc1234 |
@@ -122,7 +122,7 @@ def test_a_whole_run_is_logged_and_replaces_the_last(log, capsys):
     figure("b", 2.5, "ms", "<= 2")
     found = read(log)
     assert list(found) == ["a", "b"]
-    told = "python -m benchmarks.solver", "b", "2.5", "ms", "<= 2", "missed", "", date.today().isoformat(), "abc1234"
+    told = "python -m benchmarks solver", "b", "2.5", "ms", "<= 2", "missed", "", date.today().isoformat(), "abc1234"
     assert found["b"][:-1] == told
     assert "Python" in found["b"].machine and "numba" in found["b"].machine
     assert capsys.readouterr().out.split("\n")[0] == "figure b = 1.235 ms (goal <= 2): met"

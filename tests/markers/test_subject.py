@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from benchmarks.closures_swing import HERE, OBSERVED, PRIORS, gear_of, swing
+from benchmarks.accuracy.closures.closures_swing import HERE, OBSERVED, PRIORS, gear_of, swing
 
 from kinefit import Markers, load_body
 from kinefit.bodies import BodyState

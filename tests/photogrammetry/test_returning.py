@@ -5,8 +5,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from benchmarks.surface_body import cameras, moving_arm
-from benchmarks.textured import textured_picture
+from benchmarks.accuracy.surfaces.surface_body import cameras, moving_arm
+from benchmarks.scenes.textured import textured_picture
 
 from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.errors import ObservationError

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.bags import START, Bag
-from benchmarks.fuzz_seeds_folders import packed_glb
+from benchmarks.robustness.fuzz.fuzz_seeds_folders import packed_glb
+from benchmarks.scenes.bags import START, Bag
 
 import kinefit
 from kinefit._files import read_bytes, repeated

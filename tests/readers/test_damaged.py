@@ -12,11 +12,11 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from benchmarks.fuzz import SLOW, fuzz
-from benchmarks.fuzz_mutations import mutated
-from benchmarks.fuzz_readers import READERS, seed_of
-from benchmarks.fuzz_seeds import ASF
-from benchmarks.fuzz_worker import LONGEST
+from benchmarks.robustness.fuzz.fuzz import SLOW, fuzz
+from benchmarks.robustness.fuzz.fuzz_mutations import mutated
+from benchmarks.robustness.fuzz.fuzz_readers import READERS, seed_of
+from benchmarks.robustness.fuzz.fuzz_seeds import ASF
+from benchmarks.robustness.fuzz.fuzz_worker import LONGEST
 
 from kinefit._files import parse_toml
 from kinefit.bodies import load_body
@@ -35,7 +35,7 @@ from kinefit.readers.take.file import read_take
 from kinefit.readers.video import Video
 from kinefit.sensors.kinds.surface_points import read_surface_points
 
-COPIES = 25  # of each reader here; `python -m benchmarks.product fuzz` reads thousands
+COPIES = 25  # of each reader here; `python -m benchmarks product fuzz` reads thousands
 linux = pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="memory is counted as Linux does")
 
 
@@ -73,7 +73,7 @@ def test_damage_is_the_same_in_every_run():
 def test_a_reader_that_fails_is_counted(tmp_path):
     code = (
         "import os, numpy as np\n"
-        "import benchmarks.fuzz_readers as r, benchmarks.fuzz_seeds as s, benchmarks.fuzz_worker as w\n"
+        "import benchmarks.robustness.fuzz.fuzz_readers as r, benchmarks.robustness.fuzz.fuzz_seeds as s, benchmarks.robustness.fuzz.fuzz_worker as w\n"
         "def make(folder):\n"
         "    (folder / 'a').write_bytes(b'1')\n"
         "    whole = [True]\n"

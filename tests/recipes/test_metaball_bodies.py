@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.metaballs import HELPS, arm, errors
+from benchmarks.papers.metaballs import HELPS, arm, errors
 from tests.subject.test_metaballs import on
 
 from kinefit.bodies import BodyState, load_body

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.synthetic_points import random_pose, synthetic_body
+from benchmarks.papers.markers.synthetic_points import random_pose, synthetic_body
 
 from kinefit.errors import ObservationError
 from kinefit.identification.model.model import MarkerModel

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from benchmarks.faults_solver import beyond_limits
+from benchmarks.robustness.faults_solver import beyond_limits
 from scipy.optimize import minimize
 from tests.oracle import look_at, posture, random_body, random_unit, rig_around
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.faults_solver import MAX_GAIN, SETTINGS, beyond_limits, second_call
+from benchmarks.robustness.faults_solver import MAX_GAIN, SETTINGS, beyond_limits, second_call
 from tests.oracle import posture, random_unit
 
 from kinefit.bodies import BodyState, load_body

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from benchmarks.hands_simulated import near_rig, somebody
-from benchmarks.head_turn import ERRORS, FACE, GAZE, JAW, POSE, head_moving, with_own_face
+from benchmarks.accuracy.hands.hands_simulated import near_rig, somebody
+from benchmarks.accuracy.hands.head_turn import ERRORS, FACE, GAZE, JAW, POSE, head_moving, with_own_face
 
 from kinefit import Recording, load_body, track
 from kinefit.evaluation import angle_errors

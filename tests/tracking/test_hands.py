@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.hands_simulated import fingers, hands_moving, near_rig, seen_by, somebody
+from benchmarks.accuracy.hands.hands_simulated import fingers, hands_moving, near_rig, seen_by, somebody
 
 from kinefit import Recording, load_body, track
 from kinefit.evaluation import angle_errors, joint_errors

@@ -5,9 +5,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from benchmarks.regions_cat import truth
-from benchmarks.regions_scene import away
-from benchmarks.silhouettes_cat import take_by_silhouettes
+from benchmarks.accuracy.images.regions_cat import truth
+from benchmarks.papers.silhouettes.silhouettes_cat import take_by_silhouettes
+from benchmarks.scenes.regions_scene import away
 from click.testing import CliRunner
 from tests.sensors.regions.test_silhouette import calibration, silhouettes
 from tests.sensors.scenes import posture, ring

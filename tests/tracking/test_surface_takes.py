@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.surface_body import errors, moving_arm
+from benchmarks.accuracy.surfaces.surface_body import errors, moving_arm
 
 from kinefit.bodies.body_surfaces import sample
 from kinefit.errors import FileError, KinefitError, ObservationError

@@ -52,7 +52,7 @@ _FIRST_FRAMES = 5  # of the first fit
 _JOINT_ROUNDS = 3  # of match and solve, of the joint fit
 _LANDMARK_SIGMA = 0.005  # [m] of a detector's points about the fit of the keypoints
 # Systematic errors of a surface of simple shapes on a person of another shape: RMS errors of three simulated Anny
-# people (draws 100 to 102 of `benchmarks.mixed_misfit`).
+# people (draws 100 to 102 of benchmark `mixed_misfit`).
 _SURFACE_SIGMA = np.array([0.003, 0.003, 0.003, 0.004, 0.004, 0.004, 0.0])  # [m, rad, s]
 _UP_SIGMA = 0.01  # [m] in addition, upwards
 

@@ -35,7 +35,7 @@ _MIN_MIRROR_RATIO = 1.5
 """Ratio of the misfits of a take and of its mirror image from which one of them is right.
 
 The right one's ratio is 2.4 to 5.0 in the labelled takes of `markers` (walks, squats, jumps, dances, a sprint), on
-which this was chosen, and 2.7 to 6.3 in the others (`benchmarks.faults_sides`); 1.0 where labels say nothing of sides.
+which this was chosen, and 2.7 to 6.3 in the others (benchmark `faults_sides`); 1.0 where labels say nothing of sides.
 """
 _MAX_MISFIT = 3.0  # sigmas of the better fit, the root mean square: 0.1 to 2.0 where labels are right
 _MIN_ONE_SIDED_GAIN = 4.0  # sum of squares by which markers of one side decide: one of 4 cm sigma, 16 cm off, has 12

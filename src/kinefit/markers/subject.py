@@ -38,7 +38,7 @@ _INDEPENDENT_FRAMES = 1.0
 Marker errors are systematic: skin slides with the posture, and joints are no exact balls or hinges. Of 0.5, 1, 2, 4, 16
 and 80, values from 0.5 to 2 give the best joint centres for four laboratories' subjects (15 to 16 mm; 20 mm with 16).
 With errors counted as in `subject.excess`, the left toe marker of Plug-in-Gait's trial is 13 cm off, the ankle's angle
-37 degrees. This and the constants above were chosen on the trials of `benchmarks.markers_fit`, which are no test set.
+37 degrees. This and the constants above were chosen on the trials of benchmark `markers_fit`, which are no test set.
 """
 _RANDOM_POSTURES = 40  # of the generic body, for the first estimate of the size
 _MAX_RATE_HZ = 30.0  # trials are thinned to this rate

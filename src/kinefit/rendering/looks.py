@@ -24,7 +24,7 @@ _MAX_RATIO = 3.0  # of a segment's length or width to the humanoid's: beyond, a 
 
 
 class _Template(NamedTuple):
-    """What the file holds (`benchmarks.person_skin.skin`), and the humanoid's rest and extents (S, 3) [m]."""
+    """What the file holds (benchmark `person_skin.skin`), and the humanoid's rest and extents (S, 3) [m]."""
 
     names: list[str]
     vertices: NDArray

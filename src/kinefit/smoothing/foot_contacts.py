@@ -15,7 +15,7 @@ from kinefit.motion import UP_AXES
 _SOLE_HEIGHT = 0.04  # [m] above the lowest landmark of the rest pose, below which a landmark belongs to a sole
 _MAX_CONTACT_SPEED = 0.15  # [m/s]: a swinging foot reaches several m/s; a standing one seems to move by its noise
 _MIN_RELEASE_SPEED = 0.30  # [m/s] that ends a contact: of 1 to 6 times `_MAX_CONTACT_SPEED`, in simulated jumps, all
-# from 1.5 on end flicker, and none extends contact into flight (seeds 0 to 2, `benchmarks.closures_contacts`)
+# from 1.5 on end flicker, and none extends contact into flight (seeds 0 to 2, benchmark `closures_contacts`)
 _MAX_CONTACT_HEIGHT = 0.04  # [m] above the point's contact height: a foot lifted to step exceeds it within few frames
 _MIN_CONTACT_S = 0.1  # [s]: the shortest stance of a sprinter
 _CONTACT_STD = 0.01  # [m] of a point in contact: soles and skin deform

@@ -31,7 +31,7 @@ _OFFSET_PRIOR_STDS = 0.01, 0.005  # [m] of landmark offsets on long and on short
 _POSTURE_PRIOR_SHARE = 0.1  # frames of a take are a few independent postures at most
 _SHAPE_VARIANCE_FACTOR = 1.2  # of fitted shapes: their covariance takes limits, weights and priors as known.
 # With 1.0, 1.2 and 1.6 intervals of 95 % hold 95.5, 96.5 and 97.7 % of the joints of twenty known people with BODY_25B
-# (`benchmarks.error_bars`); the worst group of angles 88, 89 and 91 %. MEDIAPIPE_33 is the check.
+# (benchmark `error_bars`); the worst group of angles 88, 89 and 91 %. MEDIAPIPE_33 is the check.
 _ROUNDS = 2  # of fits with a better prior standard deviation; it changes by less than a tenth from then on
 _MAX_POINT_DISTANCE = 0.15  # [m] median distance from triangulated points of a plausible pose
 

@@ -18,7 +18,7 @@ from kinefit.sensors.channels import Channels
 from kinefit.sensors.points.views import MIRRORED, TERMS, ViewBias, directions, trunks
 
 _COEFFICIENT_PRIOR_STD = 0.01  # [m]: of 1, 1.4 and 2 cm the best on three recordings of the built-in network
-# (`benchmarks.people_bias`); 2 cm gains more on two of them, and loses 7 % on the third
+# (benchmark `people_bias`); 2 cm gains more on two of them, and loses 7 % on the third
 _NOISE_STD = 0.01  # [m] of a keypoint's remaining error: frames of a take are alike, so all count as one measurement
 _POINT_STD = 0.03  # [m] of s, the error of a fitted body's point in a frame
 _OUTLIER_SIGMAS = 2.0  # at which a keypoint's weight falls to 1/4

@@ -197,7 +197,7 @@ def test_body_files(tmp_path):
 
 
 def test_the_exported_limbs_are_closed(tmp_path):
-    from benchmarks.surface_body import moving_arm
+    from benchmarks.accuracy.surfaces.surface_body import moving_arm
 
     from kinefit.exporters import write_glb
     from kinefit.rendering.looks import body_mesh

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.bar_scene import bar_rig, draw_bar, see_bar, wave_bar
+from benchmarks.scenes.bar_scene import bar_rig, draw_bar, see_bar, wave_bar
 
 from kinefit.calibration.bar.bundle import BarProblem
 from kinefit.calibration.bar.calibrate import calibrate_bar

@@ -86,7 +86,7 @@ def test_static_points_join():
 
 @pytest.mark.slow
 def test_clocks_are_found_to_a_fraction_of_a_frame():
-    """The take has one and a half slow seconds; see benchmarks/calibrate.py for longer ones."""
+    """The take has one and a half slow seconds; see benchmarks/accuracy/video/calibrate.py for longer ones."""
     late = (0.0, 2.3, -0.6, 0.0)
     keypoints = [shifted(k, -f / 30.0) for k, f in zip(seen(), late, strict=True)]
     found = refine(room(), keypoints, BODY, sigma=2.0, time_offsets=True)

@@ -1,7 +1,7 @@
 """A subject that is no human: a six-axis arm with a body file and a marker set of its own, by the commands (P5)."""
 
 import pytest
-from benchmarks.markers_robot import learn, make_robot, single_frames, whole_take
+from benchmarks.accuracy.markers.markers_robot import learn, make_robot, single_frames, whole_take
 
 from kinefit.identification.model.model import load_model
 

@@ -211,7 +211,7 @@ def test_bounds_and_neighbours_cut_paths_of_videos(folder, tmp_path):
 
 
 def test_a_motion_must_be_of_the_same_videos(folder, tmp_path):
-    from benchmarks.surface_body import moving_arm
+    from benchmarks.accuracy.surfaces.surface_body import moving_arm
 
     from kinefit.exporters.motion_file import write_motion
 

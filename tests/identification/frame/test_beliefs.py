@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.synthetic_points import random_pose, synthetic_body
+from benchmarks.papers.markers.synthetic_points import random_pose, synthetic_body
 
 from kinefit.identification.frame.beliefs import MAX_NOISE, MIN_NOISE, Beliefs, learn_beliefs
 from kinefit.identification.frame.identify import identify

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.synthetic_points import mean_length, random_pose, synthetic_body
+from benchmarks.papers.markers.synthetic_points import mean_length, random_pose, synthetic_body
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.synthetic_points import synthetic_body
+from benchmarks.papers.markers.synthetic_points import synthetic_body
 from scipy.optimize import minimize
 
 from kinefit.geometry.se3 import exp_so3, log_so3

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.marker_takes import CASES, broken, load, training, truth_of
+from benchmarks.scenes.marker_takes import CASES, broken, load, training, truth_of
 
 from kinefit.bodies.marker_sets import placement
 from kinefit.errors import ObservationError

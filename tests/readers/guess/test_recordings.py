@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.bags import Bag
+from benchmarks.scenes.bags import Bag
 
 from kinefit.errors import FileError, TakeError
 from kinefit.readers.guess.folder import guess_take

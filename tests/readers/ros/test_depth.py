@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from benchmarks.bags import START, Bag
+from benchmarks.scenes.bags import START, Bag
 
 from kinefit import read_depth
 from kinefit.errors import CalibrationError, FileError, ObservationError

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.bags import Bag
+from benchmarks.scenes.bags import Bag
 
 from kinefit import read_calibration
 from kinefit.errors import CalibrationError, FileError

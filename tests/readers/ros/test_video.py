@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.bags import START, Bag
+from benchmarks.scenes.bags import START, Bag
 
 from kinefit.errors import FileError, ObservationError
 from kinefit.readers.video import Video

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from benchmarks import fuzz_seeds
+from benchmarks.robustness.fuzz import fuzz_seeds
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation

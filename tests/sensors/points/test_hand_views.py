@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.hands_simulated import fingers, hands_moving, near_rig
+from benchmarks.accuracy.hands.hands_simulated import fingers, hands_moving, near_rig
 from hypothesis import given
 from hypothesis import strategies as st
 

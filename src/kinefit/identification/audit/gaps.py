@@ -15,7 +15,7 @@ MAX_ISLAND_FRAMES = 10
 
 MAX_DISTANCE_RATIO = 0.4
 """Largest ratio of a label's distance to the other label's place over that to its own place. Of 384 simulated swaps in
-the takes of `benchmarks.markers_audit`, 0.35 finds 98.0 % and 0.42 99.2 %; 0.5 has 0.1 % false positives."""
+the takes of benchmark `markers_audit`, 0.35 finds 98.0 % and 0.42 99.2 %; 0.5 has 0.1 % false positives."""
 
 _MAX_SWAPPED_DISTANCE = 0.04
 """[m] largest distance of a label from the other label's place. On a simulated take with half of the points occluded,

@@ -1,0 +1,1 @@
+"""How exact the results are, and whether their error bars say so."""

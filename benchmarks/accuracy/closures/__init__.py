@@ -1,0 +1,1 @@
+"""People with gear that closes chains."""

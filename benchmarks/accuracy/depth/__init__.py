@@ -1,0 +1,1 @@
+"""Depth images, surfaces and renderings."""

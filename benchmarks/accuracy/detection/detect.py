@@ -1,0 +1,133 @@
+"""The built-in detector, quality "balanced", on the balancing trial, from four videos alone; and on a seated person."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks.figures import amount, data, figure, quick
+from kinefit.assets import CAMERAS
+from kinefit.errors import AssetError, ObservationError
+from kinefit.geometry.camera import ImageFrame
+from kinefit.geometry.lines import triangulate
+from kinefit.images.detectors.roi import MIRROR
+from kinefit.multiview.association import choose_people
+from kinefit.observations import Detections
+from kinefit.preparing import detecting
+from kinefit.readers.calibration.read import read_calibration
+from kinefit.readers.detections import read_detections
+
+_GOALS = {
+    "detect_speed": ("frames/s", ">= 12"), "detect_landmarks_difference": ("px", "<= 4"),
+    "detect_masks_iou": ("", ">= 0.95"), "detect_frames_tracked": ("%", "== 100"),
+    "detect_wrong_person": ("pictures", "== 0"), "detect_seated_tracked": ("%", "== 100"),
+    "detect_processor_time": ("ms a picture", "<= 41.7"),
+}  # fmt: skip
+_RUNS = amount(3, 1)  # the fastest counts: other programs only slow it down
+
+
+def run() -> None:
+    """Print every figure of the built-in detector."""
+    trial, seated = data("video_balancing_4cam"), data("mv4_upperbody_caliscope")
+    try:
+        detecting.networks(None, print)
+        missing = "" if trial else "no recording"
+    except (AssetError, ObservationError) as error:
+        missing = error.problem
+    if missing or trial is None:
+        for name, (unit, goal) in _GOALS.items():
+            figure(name, None, unit, goal, missing)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        _trial(trial, Path(folder))
+        if seated is not None and not quick():
+            _seated(seated, Path(folder))
+
+
+def _detect(videos: dict[str, Path], folder: Path) -> dict[str, Detections]:
+    span = amount(None, (0.0, 0.4))  # [s]
+    jobs = [detecting.DetectionJob(n, video, folder / f"{n}.npz", seconds=span) for n, video in videos.items()]
+    detecting.detect(jobs, detecting.DetectionSettings(masks=True, quality="balanced"), force=True, tell=print)
+    return {job.camera: read_detections(job.file) for job in jobs}
+
+
+def _trial(trial: Path, folder: Path) -> None:
+    videos = {name: trial / "videos" / f"{name}.mp4" for name in CAMERAS}
+    walls, processor = [], []
+    for _ in range(_RUNS):
+        wall, cpu = time.perf_counter(), time.process_time()
+        found = _detect(videos, folder)
+        walls.append(time.perf_counter() - wall)
+        processor.append(time.process_time() - cpu)
+    frames = len(found[CAMERAS[0]])
+    cores = min(detecting.cores(), len(CAMERAS))
+    print(f"  {frames} frames of {len(CAMERAS)} cameras in {min(walls):.2f} s on {cores} cores, everything included")
+    _figure("detect_speed", frames / min(walls))
+    _figure("detect_processor_time", 1000 * min(processor) / (frames * len(CAMERAS)))  # 12 frames/s on two cores
+    rig = read_calibration(trial / "Calib_refined_static.toml").select(CAMERAS)
+    images = [ImageFrame.letterboxed(rig[name].size, found[name].size) for name in CAMERAS]
+    chosen = choose_people(rig, [found[name].keypoints(image_frame=im) for name, im in zip(CAMERAS, images)])
+    errors, better, overlaps, present = [], [], [], 0
+    for name, person in zip(CAMERAS, chosen):
+        there = np.flatnonzero(person >= 0)
+        present += len(there)
+        truth = np.load(trial / f"mediapipe_landmarks_{name}.npy")
+        points = found[name].points[there, person[there]]
+        seen = truth[there, :, 2] > 0.5
+        gap = np.linalg.norm(points - truth[there, :, :2], axis=-1)
+        other = np.linalg.norm(points[:, MIRROR] - truth[there, :, :2], axis=-1)
+        mirrored = np.median(other, axis=1) < np.median(gap, axis=1)
+        errors.append(gap[seen])
+        better.append(np.where(mirrored[:, None], other, gap)[seen])
+        looked = there[:: amount(1, 5)]
+        iou = [_overlap(found[name], f, int(person[f]), trial / "person_masks" / name / f"{f:03d}.png") for f in looked]
+        overlaps += iou
+        print(f"  {name}: median {np.median(errors[-1]):.2f} px ({np.median(better[-1]):.2f} px with sides as in the "
+              f"other, {mirrored.sum()} pictures), masks {np.mean(iou):.3f}, lowest {min(iou):.3f}, "
+              f"{found[name].points.shape[1]} people")
+    _figure("detect_landmarks_difference", float(np.median(np.concatenate(errors))))
+    _figure("detect_masks_iou", float(np.mean(overlaps)))
+    _figure("detect_frames_tracked", 100 * present / (len(CAMERAS) * frames))
+    _figure("detect_wrong_person", float(np.sum(np.array(overlaps) < 0.5)))
+
+
+def _overlap(found: Detections, frame: int, person: int, path: Path) -> float:
+    """Shared over common area of a mask with the one on file."""
+    mine, theirs = found.mask(frame, person), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert mine is not None
+    return float((mine & (theirs > 127)).sum() / (mine | (theirs > 127)).sum())
+
+
+def _seated(seated: Path, folder: Path) -> None:
+    rig = read_calibration(seated / "config.toml")
+    ports = {name: seated / f"port_{name.removeprefix('cam_')}.mp4" for name in rig.names}
+    found = _detect(ports, folder)
+    keypoints = [found[name].keypoints() for name in rig.names]
+    chosen = choose_people(rig, keypoints)
+    agreeing = [float(np.mean(person >= 0)) for person in chosen]
+    uv = np.stack([_of_person(found[name], person) for name, person in zip(rig.names, chosen)], axis=2)
+    x = triangulate(rig, uv.reshape(-1, len(rig.names), 2)).reshape(*uv.shape[:2], 3)
+    gaps = [np.linalg.norm(rig[name].project(x) - uv[:, :, c], axis=-1) for c, name in enumerate(rig.names)]
+    told = ", ".join(
+        f"{name} {100 * share:.0f} %, {np.nanmedian(gap):.1f} px" for name, share, gap in zip(rig.names, agreeing, gaps)
+    )
+    print(f"  seated person, pictures that agree with the other cameras, reprojection of the landmarks: {told}")
+    _figure("detect_seated_tracked", 100 * float(np.mean([found[name].seen.any(axis=1) for name in rig.names])))
+
+
+def _of_person(found: Detections, person: Sequence[int] | np.ndarray) -> np.ndarray:
+    """(F, 33, 2) surely seen landmarks of the chosen person, NaN elsewhere."""
+    person = np.asarray(person)
+    rows = np.arange(len(person))
+    points, sure = found.points[rows, person], found.confidence[rows, person] > 0.5
+    return np.where((sure & (person >= 0)[:, None])[..., None], points, np.nan)
+
+
+def _figure(name: str, value: float) -> None:
+    unit, goal = _GOALS[name]
+    figure(name, value, unit, goal)

@@ -1,0 +1,1 @@
+"""Silhouettes and colours of real and rendered images."""

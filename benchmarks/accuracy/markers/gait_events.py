@@ -1,0 +1,182 @@
+"""Contacts and toe-offs of real walks, straight and turning, against force plates and against the files' own events.
+
+    python -m benchmarks gait gait_events
+
+Every file is fitted by `kinefit markers fit` with its static trial and defaults. A plate's truth is where its vertical
+force passes 20 N, of contacts that last a quarter of a second on one plate. The shares of the swing's speed that make
+an event were chosen on the children HC002D, HC036A and HC050A; the figures are of the others. Steps are compared with
+the heels' markers at the same times.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.figures import amount, data, figure
+from kinefit.exporters.report.cycles import find_cycles, gait_numbers
+from kinefit.exporters.report.feet import foot_events
+from kinefit.motion import Motion
+from kinefit.observations import Markers
+from kinefit.readers.markers import read_markers
+from kinefit.readers.motion import read_motion
+
+PRINTED = ("HC030A/straight", "HC030A/turn", "HC044A/straight", "HC044A/turn", "omcs")
+CHOSEN = ("HC002D/straight", "HC002D/turn", "HC036A/straight", "HC036A/turn", "HC050A/straight", "HC050A/turn")
+_FORCE_N, _PLATE_S, _LOADED_N = 20.0, 0.25, 200.0
+_NEAR_S, _NEAR_M, _ENDS_S = 0.15, 0.2, 0.12
+_LABELS = {"Foot Strike": "contact", "Foot Off": "off"}
+
+
+@dataclass(frozen=True)
+class Event:
+    """Of a foot ("l", "r"): "contact" or "off" at a time [s] of the file's clock."""
+
+    foot: str
+    kind: str
+    time: float
+
+
+def run() -> None:
+    """Print the figures of the walks that were kept back, and of all how many have a record."""
+    off: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    steps, records = list[float](), list[bool]()
+    for name in (*PRINTED, *CHOSEN)[: amount(None, 1)]:
+        path = _file(name)
+        if path is None:
+            continue
+        motion, markers = _fitted(path), read_markers(path)
+        cycles = find_cycles(motion)
+        records.append(cycles is not None and cycles.kind == "gait")
+        if name in CHOSEN:
+            continue
+        for source, events in (("files", _own(markers)), ("plates", _plates(path, markers))):
+            for event in events:
+                off.setdefault((source, event.kind), []).append(_missed(motion, event))
+        steps += _steps(motion, markers)
+    for source in ("plates", "files"):
+        for kind in ("contact", "off"):
+            _print(f"gait_{kind}_{source}", np.array(off.get((source, kind), [])).reshape(-1, 2))
+    reason = "" if steps else "no recording"
+    figure("gait_step_mm", float(np.sqrt(np.mean(np.square(steps)))) if steps else None, "mm RMS", "<= 5", reason)
+    figure("gait_records", 100.0 * float(np.mean(records)) if records else None, "% of files", ">= 100", reason)
+
+
+def _print(name: str, found: NDArray) -> None:
+    """Mean and standard deviation of errors, and how many are within two of their own (N, 2) [s]."""
+    known = found[np.isfinite(found[:, 0])]
+    print(f"# {name}: {len(known)} of {len(found)} events found")
+    reason = "" if len(known) else "no recording, or the package ezc3d is not installed"
+    error, std = 1e3 * known.T if len(known) else (np.zeros(0), np.zeros(0))
+    figure(f"{name}_mean", abs(float(error.mean())) if len(known) else None, "ms", "<= 8", reason)
+    figure(f"{name}_sd", float(error.std()) if len(known) else None, "ms", "<= 12", reason)
+    held = 100.0 * float(np.mean(np.abs(error) <= 2.0 * std)) if len(known) else None
+    figure(f"{name}_held", held, "% within 2 sigma", ">= 90", reason)
+
+
+def _file(name: str) -> Path | None:
+    if name == "omcs":
+        folder = data("gait_omcs")
+        return None if folder is None else next(folder.glob("*.c3d"))
+    folder = data("gait_biomechzoo")
+    return None if folder is None else folder / f"{name}.c3d"
+
+
+def _fitted(path: Path) -> Motion:
+    static = path.parent / "static.c3d"
+    options = ["--static", str(static)] if static.exists() else []
+    with tempfile.TemporaryDirectory() as out:
+        command = [sys.executable, "-m", "kinefit", "markers", "fit", str(path), "-o", out, "--formats", "motion"]
+        subprocess.run([*command, *options], check=True, capture_output=True)
+        return read_motion(Path(out) / "motion.npz")
+
+
+def _own(markers: Markers) -> list[Event]:
+    """Events of the file, but for those next to its ends."""
+    first, last = markers.times[0] + _ENDS_S, markers.times[-1] - _ENDS_S
+    return [
+        Event(e.context[:1].lower(), _LABELS[e.label], e.time)
+        for e in markers.events if e.label in _LABELS and first < e.time < last
+    ]  # fmt: skip
+
+
+def _plates(path: Path, markers: Markers) -> list[Event]:
+    """Events by force plates under one foot."""
+    try:
+        import ezc3d
+    except ImportError:
+        return []
+    read = ezc3d.c3d(str(path), extract_forceplat_data=True)
+    rate = read["header"]["analogs"]["frame_rate"]
+    start, count = float(markers.times[0]), round(_PLATE_S * rate)
+    out = []
+    for plate in read["data"]["platform"]:
+        force, centre = np.abs(np.array(plate["force"])[2]), 0.001 * np.array(plate["center_of_pressure"])
+        loaded = force - np.median(force[force < np.quantile(force, 0.3) + 5.0]) > _FORCE_N
+        for i in np.flatnonzero(np.diff(loaded.astype(int))):
+            lands = bool(loaded[i + 1])
+            stand = slice(i + 1, i + 1 + count) if lands else slice(max(i + 1 - count, 0), i + 1)
+            if len(force[stand]) < count or loaded[stand].mean() < 0.8 or force[stand].max() < _LOADED_N:
+                continue
+            time = start + (i + 1) / rate
+            middle = i + (count // 2 if lands else -count // 2)
+            feet = dict(_feet_near(markers, start + middle / rate, centre[:2, middle]))
+            foot = min(feet, key=lambda side: feet[side])
+            if feet[foot] < _NEAR_M:
+                out.append(Event(foot, "contact" if lands else "off", time))
+    return out
+
+
+def _feet_near(markers: Markers, time: float, centre: NDArray) -> Iterator[tuple[str, float]]:
+    """(foot, [m] from a plate's centre of pressure (2,) at a time)."""
+    frame = int(np.argmin(np.abs(markers.times - time)))
+    for side in "lr":
+        points = [markers.positions[frame, _index(markers, f"{side.upper()}{end}"), :2] for end in ("HEE", "TOE")]
+        yield side, float(np.linalg.norm(np.nanmean(points, axis=0) - centre))
+
+
+def _index(markers: Markers, label: str) -> int:
+    return next(i for i, name in enumerate(markers.names) if name.rpartition(":")[2] == label)
+
+
+def _missed(motion: Motion, event: Event) -> tuple[float, float]:
+    """[s] how much later the motion has an event, with the standard deviation that it says; NaN without one near."""
+    feet = foot_events(motion)
+    foot = feet and (feet.left if event.foot == "l" else feet.right)
+    times, stds = (foot.contacts, foot.contact_std) if event.kind == "contact" else (foot.offs, foot.off_std)
+    near = int(np.argmin(np.abs(times - event.time))) if len(times) else -1
+    found = near >= 0 and abs(times[near] - event.time) < _NEAR_S
+    return (float(times[near] - event.time), float(stds[near])) if found else (np.nan, np.nan)
+
+
+def _steps(motion: Motion, markers: Markers) -> list[float]:
+    """[mm] how much longer every step is than by the heels' markers at the same times."""
+    cycles = find_cycles(motion)
+    if cycles is None or cycles.feet is None:
+        return []
+    lengths, out = gait_numbers(motion, cycles)["step length [m]"], []
+    feet = {"left": cycles.feet.left, "right": cycles.feet.right}
+
+    def heel(side: str, time: float) -> NDArray:
+        frame = int(np.argmin(np.abs(markers.times - time)))
+        return np.asarray(markers.positions[frame, _index(markers, f"{side[0].upper()}HEE"), :2])
+
+    for side, quantity in zip(cycles.sides, lengths, strict=True):
+        opposite = "right" if side.name == "left" else "left"
+        for (start, stop), length in zip(side.times, quantity.values, strict=True):
+            landed = feet[opposite].contacts
+            landed = landed[(landed > start) & (landed < stop)]
+            if len(landed) == 1:
+                later = 0.1 * (stop - start)  # as the record has it
+                begin, end = (heel(side.name, time + later) for time in (start, stop))
+                middle = heel(opposite, landed[0] + later)
+                along = (end - begin) / np.linalg.norm(end - begin)
+                out.append(1e3 * (length - float((end - middle) @ along)))
+    return [value for value in out if np.isfinite(value)]

@@ -1,0 +1,1 @@
+"""Several sensors together, by take files."""

@@ -1,0 +1,1 @@
+"""Telephones of which nothing is known."""

@@ -1,0 +1,1 @@
+"""Keypoints of calibrated videos, and the calibration."""

@@ -1,0 +1,113 @@
+"""The size of the house, counted in the sources: `python -m benchmarks house`."""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import tokenize
+from collections import Counter
+from functools import cache
+
+from benchmarks.figures import ROOT, figure
+from benchmarks.house.house_imports import PACKAGE, circles
+
+_LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
+_DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+_CAPITALS = re.compile(r"\(?_?[A-Z][A-Z0-9_]*(, _?[A-Z][A-Z0-9_]*)*\)?$")
+HOUSE_SIZE = ("code_lines", "statements", "tokens", "literals", "constants")
+"""What the ratchet of `tests/test_house.py` holds."""
+
+_ASKED = re.compile(r"(Frame|Sensor|Measurement|Matched)$")
+"""Ends of the class names of which a question of type is a question on sensors or frames."""
+
+_MAX_PARAMETERS = 8
+
+
+def source_size(text: str) -> Counter[str]:
+    """Size of one source in every unit of `HOUSE_SIZE`: code lines, statements, tokens, literals, constants.
+
+    Blanks, comments and docstrings count nothing but as a statement each. Literals are numbers other than 0, 1, 2 and
+    a half; constants are statements of a module that give a value to a name in capitals.
+    """
+    tree, lines, size = ast.parse(text), set(), Counter(dict.fromkeys(HOUSE_SIZE, 0))
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type not in _LAYOUT:
+            lines.update(range(token.start[0], token.end[0] + 1))
+            size["tokens"] += 1
+    for node in ast.walk(tree):
+        size["statements"] += isinstance(node, ast.stmt)
+        size["literals"] += isinstance(node, ast.Constant) and _is_literal(node.value)
+        if isinstance(node, _DOCUMENTED) and ast.get_docstring(node) is not None:
+            lines.difference_update(range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1))
+            size["tokens"] -= 1
+    for node in tree.body:
+        targets = getattr(node, "targets", [node.target] if isinstance(node, ast.AnnAssign) else [])
+        size["constants"] += any(_CAPITALS.match(ast.unparse(target)) for target in targets)
+    return size + Counter({"code_lines": len(lines)})
+
+
+def _is_literal(value: object) -> bool:
+    return isinstance(value, int | float | complex) and not isinstance(value, bool) and value not in (0, 1, 2, 0.5)
+
+
+def code_lines(text: str) -> int:
+    """Lines of a source without blanks, comments and docstrings."""
+    return source_size(text)["code_lines"]
+
+
+def type_questions(tree: ast.AST) -> set[int]:
+    """Lines that ask with `isinstance` whether something is some sensor, frame, measurement or match."""
+    calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and getattr(n.func, "id", "") == "isinstance"]
+    return {
+        call.lineno for call in calls
+        for name in ast.walk(call.args[1])
+        if _ASKED.search(getattr(name, "id", "") or getattr(name, "attr", ""))
+    }  # fmt: skip
+
+
+def many_parameters(tree: ast.AST) -> list[str]:
+    """Functions with more than eight parameters, `self` and `cls` not counted."""
+    out = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef):
+            a = node.args
+            names = [one.arg for one in (*a.posonlyargs, *a.args, *a.kwonlyargs) if one.arg not in ("self", "cls")]
+            out += [node.name] if len(names) + bool(a.vararg) + bool(a.kwarg) > _MAX_PARAMETERS else []
+    return out
+
+
+@cache
+def house_size() -> Counter[str]:
+    """Size of the whole package."""
+    return sum((source_size(path.read_text("utf-8")) for path in sorted(PACKAGE.rglob("*.py"))), Counter())
+
+
+@cache
+def all_lines() -> int:
+    """Lines that are not blank of the package with its pages' scripts, styles and tables, of tests and benchmarks."""
+    kinds = {"src": {".py", ".js", ".css", ".toml"}, "tests": {".py", ".toml"}, "benchmarks": {".py", ".toml"}}
+    files = (path for folder, ends in kinds.items() for path in (ROOT / folder).rglob("*") if path.suffix in ends)
+    return sum(sum(bool(line.strip()) for line in path.read_text("utf-8").splitlines()) for path in files)
+
+
+def run() -> None:
+    """Print the figures."""
+    texts = {path: path.read_text("utf-8") for path in sorted(PACKAGE.rglob("*.py"))}
+    trees = {path: ast.parse(text) for path, text in texts.items()}
+    size = house_size()
+    figure("house_code_lines", size["code_lines"], "", "<= 60000")
+    figure("house_statements", size["statements"], "", "<= 57000")
+    figure("house_tokens", size["tokens"], "", "<= 750000")
+    figure("house_literals", size["literals"], "numbers but 0, 1, 2, a half", "<= 5850")
+    figure("house_constants", size["constants"], "of modules", "<= 1380")
+    figure("house_all_lines", all_lines(), "of package, pages, tests and benchmarks", "<= 161000")
+    figure("house_circles", len(circles(types=True)), "groups of modules, types counted", "== 0")
+    figure("house_type_questions", sum(len(type_questions(tree)) for tree in trees.values()), "lines", "<= 5")
+    outside = [tree for path, tree in trees.items() if not path.name.startswith("_kernels")]
+    figure("house_many_parameters", sum(map(len, map(many_parameters, outside))), "functions outside kernels", "<= 20")
+    rooms = Counter(path.parent for path in texts if path.name != "__init__.py" and path.parent != PACKAGE)
+    room, files = rooms.most_common(1)[0]
+    figure("house_largest_room", files, f"files in {room.relative_to(PACKAGE).as_posix()}", "<= 15")
+    classes = Counter(n.name for tree in trees.values() for n in ast.walk(tree) if isinstance(n, ast.ClassDef))
+    figure("house_class_names_twice", sum(count > 1 for count in classes.values()), "", "== 0")

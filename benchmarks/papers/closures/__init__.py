@@ -1,0 +1,1 @@
+"""P3: closed chains, their equations and mobility."""

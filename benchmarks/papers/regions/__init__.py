@@ -1,0 +1,1 @@
+"""P3: regions of colour, bodies with gear."""

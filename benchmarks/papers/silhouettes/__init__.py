@@ -1,0 +1,1 @@
+"""P1: silhouettes, morphing surfaces, free-form contours."""

@@ -1,0 +1,1 @@
+"""P2: boxes, depth and features (VooDoo)."""

@@ -1,0 +1,1 @@
+"""What kinefit makes of wrong, damaged and hostile inputs."""

@@ -1,0 +1,1 @@
+"""The window and the live server under clicks, kills and attacks."""

@@ -1,0 +1,1 @@
+"""Files and commands as users have them."""

@@ -1,0 +1,1 @@
+"""Simulated scenes and recordings that several folders share."""

@@ -1,0 +1,1 @@
+"""How fast kinefit is, alone and beside peers, and what it needs of memory and disk."""

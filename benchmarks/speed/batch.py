@@ -1,0 +1,137 @@
+"""Many takes: how much faster two workers are, what a scheduler costs, whether a killed run ends as one that was not.
+
+Takes are simulated as those of `long`. Speed is of the whole command, workers' start included; on a machine
+that does something else besides, it is not measured. The scheduler of Dask gets takes that take no time, on two workers
+of this machine.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.figures import amount, figure
+from benchmarks.speed.long import write_long_take
+from kinefit.batch.cluster import run_there
+from kinefit.batch.one import Choices, TakeJob
+from kinefit.batch.summary import RECORD, Row
+
+TAKES = 10_000
+"""Takes that the scheduler of Dask gets."""
+
+BUSY = 0.5
+"""Processes that wait for a core already, from which on speeds are not measured."""
+
+_OPTIONS = ("--no-overlays", "--no-report", "--formats", "motion,csv")
+
+
+def run() -> None:
+    """Print the figures."""
+    with tempfile.TemporaryDirectory() as work:
+        folder = Path(work)
+        for k in range(amount(8, 2)):
+            write_long_take(folder / "sessions" / f"s{k:02d}", amount(600, 30), seed=10_000 * k)
+        speed(folder)
+        figure("batch_resume_equal", resumed(folder), "of 1", "== 1")
+    overhead(amount(TAKES, 200))
+
+
+def speed(folder: Path) -> None:
+    """Two workers against one."""
+    load, cores = _load(), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    seconds = {}
+    for workers in (1, 2):
+        began = time.monotonic()
+        _batch(folder, f"out-{workers}", workers)
+        seconds[workers] = time.monotonic() - began
+    ratio, reason = seconds[1] / seconds[2], ""
+    print(f"  {seconds[1]:.1f} s with one worker, {seconds[2]:.1f} s with two: {ratio:.2f} times; load {load:.1f}")
+    if cores < 2 or load > BUSY:
+        ratio, reason = None, f"{cores} cores, and {load:.1f} processes ran on them before"
+    figure("batch_two_workers", ratio, "times as fast", ">= 1.9", reason)
+
+
+def resumed(folder: Path) -> float:
+    """1 where one worker, two, and a run that was killed and gone on with leave the same files, bit for bit."""
+    one, two = (contents(folder / f"out-{workers}") for workers in (1, 2))
+    process = subprocess.Popen(_command(folder, "killed", 2), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while process.poll() is None and not list((folder / "killed").rglob(RECORD)):
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    done = {path: path.stat().st_mtime_ns for path in (folder / "killed").rglob(RECORD)}
+    unfinished = len(list((folder / "killed").rglob("unfinished")))
+    time.sleep(1.0)  # its workers end
+    _batch(folder, "killed", 2)
+    kept = all(path.stat().st_mtime_ns == time_ns for path, time_ns in done.items())
+    takes = len(list((folder / "sessions").iterdir()))
+    print(f"  killed after {len(done)} of {takes} takes, {unfinished} unfinished; those done were kept: {kept}")
+    same = one == two == contents(folder / "killed") and kept and 0 < len(done) < takes
+    shutil.rmtree(folder / "killed")
+    return float(same)
+
+
+def contents(out: Path) -> dict[Path, object]:
+    """All that a batch leaves, arrays in place of archives, which hold the time of their writing."""
+    found: dict[Path, object] = {}
+    for path in sorted(out.rglob("*")):
+        if path.suffix == ".npz":
+            with np.load(path) as arrays:
+                found[path.relative_to(out)] = {name: arrays[name].tobytes() for name in arrays.files}
+        elif path.is_file() and path.name != RECORD:
+            found[path.relative_to(out)] = path.read_bytes()
+    return found
+
+
+def overhead(takes: int) -> None:
+    """What Dask adds to each of so many takes."""
+    goal = ("ms", "<= 50")
+    try:
+        from distributed import LocalCluster
+    except ImportError:
+        figure("batch_dask_overhead_ms", None, *goal, "the extra cluster is not installed")
+        return
+    jobs = [TakeJob(Path(f"s{k}/take.toml"), f"s{k}", Path(f"out/s{k}"), f"s{k}", Choices()) for k in range(takes)]
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0", protocol="tcp://") as cluster:
+        began = time.monotonic()
+        rows = dict(run_there(nothing, jobs, address=cluster.scheduler_address, retries=2))
+        seconds = time.monotonic() - began
+    if rows != {k: nothing(job) for k, job in enumerate(jobs)}:
+        raise RuntimeError("rows are missing or of other takes")
+    print(f"  {takes} takes in {seconds:.1f} s")
+    figure("batch_dask_overhead_ms", 1e3 * seconds / takes, *goal)
+
+
+def nothing(job: TakeJob) -> tuple[Row, ...]:
+    """A take that is done at once."""
+    return (Row(take=job.label, folder=job.folder, frames=1, seconds=0.1, quality=1.0, lost=0.0),)
+
+
+def _command(folder: Path, out: str, workers: int) -> list[str]:
+    words = ["batch", f"{folder}/sessions/**/take.toml", "--out", str(folder / out), "--workers", str(workers)]
+    return [sys.executable, "-m", "kinefit", *words, *_OPTIONS]
+
+
+def _batch(folder: Path, out: str, workers: int) -> None:
+    subprocess.run(_command(folder, out, workers), check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def _load() -> float:
+    """Processes that run or wait for a core, as /proc tells it now; else the mean of the last minute."""
+    try:
+        return float(np.mean([_running() for _ in range(10)]))
+    except (OSError, IndexError, ValueError):
+        return os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+
+
+def _running() -> int:
+    time.sleep(0.1)
+    return int(Path("/proc/loadavg").read_text().split()[3].partition("/")[0]) - 1
