@@ -4,9 +4,3 @@
 figure can still be measured, `python -m benchmarks AREA [PART ...] [--quick]` one area or some of its parts. Whole runs
 log their figures, unless `--no-log` is given; `python -m benchmarks.ledger` fills the tables of docs/figures.md.
 """
-
-AREAS = (
-    "solver", "video", "depth", "silhouettes", "regions", "photogrammetry", "markers", "mixed", "people", "hands",
-    "phones", "closures", "gait", "sigma", "product", "faults", "papers", "house",
-)  # fmt: skip
-"""Modules that run alone."""

@@ -1,5 +1,6 @@
-"""All areas one after the other, each in a process of its own: `python -m benchmarks [AREA ...] [--quick [--brief]]`.
+"""`python -m benchmarks AREA [PART ...] [--quick [--brief]]` runs one area or some of its parts.
 
+Without an area, or with several, each runs in a process of its own, one after the other.
 In the quick form, which is no measure of speed, two at a time; what each prints is shown when it has ended. With
 `--brief`, too, an area ends after the part that runs after 40 s, and begins with another part each day. The exit
 code is 0 where every area ran to its end; figures that are missed or not measured do not change it.
@@ -13,7 +14,8 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-from benchmarks import AREAS
+from benchmarks.areas import AREAS
+from benchmarks.figures import module_of, run_parts
 
 LIMIT = 600.0
 """[s] for the quick form of an area; about a minute on two free cores."""
@@ -23,9 +25,19 @@ SIDE_BY_SIDE = 2
 
 
 def main(words: list[str]) -> None:
-    """Run the areas named, or all; the other words are options of each."""
+    """Run some parts of one area in this process, or several areas; the other words are options of each."""
     options = [word for word in words if word.startswith("--")]
     chosen = [word for word in words if word not in options]
+    if words and not AREAS.get(words[0], "parts"):
+        module_of(words[0]).main(words[1:])
+    elif chosen and chosen[0] in AREAS and not (len(chosen) > 1 and AREAS.keys() >= {*chosen}):
+        run_parts(chosen[0], [*chosen[1:], *options])
+    else:
+        run_areas(chosen, options)
+
+
+def run_areas(chosen: list[str], options: list[str]) -> None:
+    """Run areas, each in a process of its own; all where none is named."""
     unknown = [name for name in chosen if name not in AREAS]
     if unknown:
         sys.exit(f"no area {', '.join(unknown)}; there are: {', '.join(AREAS)}")
@@ -41,7 +53,7 @@ def main(words: list[str]) -> None:
 def run(area: str, options: list[str]) -> str:
     """How an area came out."""
     began, quick = time.monotonic(), "--quick" in options
-    command, limit = [sys.executable, "-m", f"benchmarks.{area}", *options], LIMIT if quick else None
+    command, limit = [sys.executable, "-m", "benchmarks", area, *options], LIMIT if quick else None
     if not quick:
         print(f"\n## {area}", flush=True)
     kept = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} if quick else {}

@@ -39,8 +39,7 @@ AREAS: dict[str, dict[str, str]] = {
         "silhouettes_cga": "conformal geometric algebra",
         "silhouettes_morphing": "a morphing shoulder, rendered",
         "silhouettes_morphing_take": "the same shoulder by takes, every joint free",
-        "silhouettes_shoulders":
-        "the real trial with shoulders that morph and with stiff ones, in a camera held out",
+        "silhouettes_shoulders": "the real trial with shoulders that morph and with stiff ones, in a camera held out",
         "silhouettes_collar_bones": "shoulders with joints of their own, rendered",
         "silhouettes_torso": "a man's torso into a woman's, with local morphs on top",
         "silhouettes_track": "the real trial by silhouettes alone",
@@ -93,8 +92,7 @@ AREAS: dict[str, dict[str, str]] = {
         "body_trackers": "trackers on the body, made of real marker plates, against the fit to all markers",
         "markers_speed": "time of large sets, and of a whole take from points to angles",
     },
-    "mixed": {
-    },
+    "mixed": {},
     "people": {
         "people_real": "two people in four real videos, by the built-in detector",
         "people_detectors": "one detector and two, on the real trial",
@@ -107,16 +105,13 @@ AREAS: dict[str, dict[str, str]] = {
         "people_rough": "the same as detectors see people in real rooms: missed, doubled, merged, behind furniture",
     },
     "hands": {
-        "hands_simulated":
-        "random motions of fingers before four cameras, through the command; speed beside the humanoid",
+        "hands_simulated": "random motions of fingers before four cameras, by the command; speed beside the humanoid",
         "hands_real": "a seated person with both hands before four cameras, each of them held out of the fit",
-        "head_turn":
-        "random turns of the head before four cameras and one, through the command; jaw and gaze before four",
+        "head_turn": "random turns of the head before four cameras and one, by the command; jaw and gaze before four",
     },
     "phones": {
         "phones_time": "videos that dropped frames, and cameras of unequal rates",
-        "phones_rooms":
-        "simulated rooms of which nothing is known: cameras, clocks and motion from the people in view",
+        "phones_rooms": "simulated rooms of which nothing is known: cameras, clocks and motion from the people in view",
         "phones_speed": "from a folder with four videos of ten seconds to the report: time and memory",
         "phones_floor": "the floor under one walker, rooms and a balancing trial: tilt, height, feet that slide",
         "phones_real": "real recordings without their calibrations, from the videos to the motion",
@@ -159,8 +154,7 @@ AREAS: dict[str, dict[str, str]] = {
         "faults_live": "forbidden origins, hosts and wishes before `kinefit live`",
         "faults_folder": "classes that an unfinished folder of results brings in, and kills that it survives",
         "faults_readers": "images that claim much and files that take long: seconds and memory until the error",
-        "faults_strangers":
-        "code, files and clocks of strangers in folders of recordings that run, hang or are lost",
+        "faults_strangers": "code, files and clocks of strangers in folders of recordings that run, hang or are lost",
         "faults_strangers_window": "attacks on the window in a real browser that succeed",
         "faults_inputs": "takes with wrong files that `kinefit track` names, and false alarms on right ones",
         "faults_users": "files as users have them: what they state is read, or named",
@@ -178,6 +172,7 @@ AREAS: dict[str, dict[str, str]] = {
         "house_words": "private words, names of constants, docstrings of public functions",
     },
 }
-"""{area: {part: what it is about}}. A part is the module of that name, with a function `run`. An area without parts is the
-module of that name, with a function `main` and a command line of its own.
+"""{area: {part: what it is about}}. A part is the module of that name, with a function `run`.
+
+An area without parts is the module of that name, with a function `main` and a command line of its own.
 """

@@ -9,21 +9,22 @@ import shlex
 import sys
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import date
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import TypeVar
 
-Amount = TypeVar("Amount")
+from benchmarks.areas import AREAS
 
+ROOT = Path(__file__).resolve().parents[1]
+Amount = TypeVar("Amount")
 
 _RELATIONS = {"<=": operator.le, ">=": operator.ge, ">": operator.gt, "==": operator.eq}
 
 
-def figure(
-    name: str, value: float | None, unit: str, goal: str, reason: str = "", *, whole: bool = True
-) -> bool:
+def figure(name: str, value: float | None, unit: str, goal: str, reason: str = "", *, whole: bool = True) -> bool:
     """Print `figure NAME = VALUE UNIT (goal GOAL): met|missed|not measured (reason)`; log it in a whole run.
 
     Parameters
@@ -37,7 +38,7 @@ def figure(
     verdict = ("met" if holds(value, goal) else "missed") if known else "not measured"
     reason = "" if known else reason or "no value"
     print(f"figure {name} = {text or '-'} {unit} (goal {goal}): {verdict}{f' ({reason})' * (not known)}", flush=True)
-    if whole and (command := _command()):
+    if whole and not quick() and (command := os.environ.get(COMMAND)):
         from benchmarks.ledger import record
 
         record(name, text, unit, goal, verdict, reason, command=command)
@@ -58,21 +59,22 @@ def _printed(value: float, goal: str) -> str:
     return next(text for text in texts if holds(float(text), goal) == holds(value, goal))
 
 
-_PART: list[str] = []
-"""Words of the command that runs one part of an area alone; empty before `run_parts` has begun with it."""
+COMMAND = "KINEFIT_BENCHMARKS_COMMAND"
+"""Set in the environment while a whole run goes on whose figures are logged, so that processes that a part starts log
+theirs, too: the command of the area and the part."""
 
 
-def _command() -> str:
-    """The command whose figures are logged; empty in the quick form, with `--no-log`, and in other programs."""
-    program = Path(sys.argv[0]).resolve()
-    if quick() or {"--quick", "--no-log"} & {*sys.argv} or program.parent != Path(__file__).resolve().parent:
-        return ""
-    return shlex.join(["python", "-m", f"benchmarks.{program.stem}", *(_PART or sys.argv[1:])])
+def log_as(*words: str) -> None:
+    """Log what is printed from now on as printed by `python -m benchmarks WORDS`."""
+    from benchmarks.ledger import commit
+
+    os.environ[COMMAND] = shlex.join(["python", "-m", "benchmarks", *words])
+    commit()  # that of the code which is imported now, whatever is edited while the parts run
 
 
 def data(name: str) -> Path | None:
     """Folder of a recording: below `KINEFIT_DATA`, else `../shared/data` beside the checkout; None where absent."""
-    root = Path(os.environ.get("KINEFIT_DATA") or Path(__file__).parents[1].parent / "shared" / "data")
+    root = Path(os.environ.get("KINEFIT_DATA") or ROOT.parent / "shared" / "data")
     return root / name if (root / name).exists() else None
 
 
@@ -109,37 +111,37 @@ def turned(parts: Sequence[str]) -> Sequence[str]:
     return [*parts[first:], *parts[:first]]
 
 
-def run_parts(parts: Mapping[str, str]) -> None:
-    """Print the figures of the parts that the command line names; of all, where it names none.
+def module_of(name: str) -> ModuleType:
+    """The module of that name, in whatever folder of benchmarks: names are there once."""
+    (path,) = (ROOT / "benchmarks").rglob(f"{name}.py")
+    return import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
+
+
+def run_parts(area: str, words: Sequence[str]) -> None:
+    """Print the figures of the parts of an area that the words name; of all, where they name none.
 
     A part that does not end is told with its traceback, and the others go on; the process then ends with an error.
-
-    Parameters
-    ----------
-    parts : {module of this package with a function `run`: what it is about}
     """
-    options = {word for word in sys.argv[1:] if word.startswith("--")}
-    chosen = [word for word in sys.argv[1:] if word not in options]
+    parts = AREAS[area]
+    options = {word for word in words if word.startswith("--")}
+    chosen = [word for word in words if word not in options]
     unknown = [name for name in chosen if name not in parts] + sorted(options - {*OPTIONS})
     if unknown:
         sys.exit(f"no part {', '.join(unknown)}; there are: {', '.join(parts)}, and {', '.join(OPTIONS)}")
     if "--quick" in options:
         os.environ[QUICK] = "1"
-    paths = [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]  # processes that parts start find this
-    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))  # package, after a command ran in theirs, too
-    if _command():
-        from benchmarks.ledger import commit
-
-        commit()  # that of the code which is imported now, whatever is edited while the parts run
+    find_benchmarks()
     broken, start = [], time.monotonic()
     for name in chosen or (turned(list(parts)) if "--brief" in options else parts):
         if "--brief" in options and time.monotonic() - start > BRIEF_S:
             print(f"\n# {name}: not begun, {LEFT_OUT}", flush=True)
             continue
         print(f"\n# {name}: {parts[name]}", flush=True)
-        began, _PART[:] = time.monotonic(), [name]
+        began = time.monotonic()
+        if not options & {"--quick", "--no-log"}:
+            log_as(area, name)
         try:
-            import_module(f"benchmarks.{name}").run()
+            module_of(name).run()
         except Exception:
             traceback.print_exc(file=sys.stdout)
             broken.append(name)
@@ -147,6 +149,12 @@ def run_parts(parts: Mapping[str, str]) -> None:
     broken += FAILED
     if broken:
         sys.exit(f"did not end: {', '.join(broken)}")
+
+
+def find_benchmarks() -> None:
+    """Processes that are started from now on find this package, and log nothing but what `log_as` asks for."""
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    os.environ.pop(COMMAND, None)
 
 
 def peers() -> bool:

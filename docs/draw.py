@@ -39,8 +39,8 @@ DRAWN = {
 
 BENCHMARKS = {
     "anny.jpg": "python -m benchmarks silhouettes silhouettes_anny",
-    "depth_start.png": "python -m benchmarks depth depth_real docs/images",
-    "markers_synthetic.svg": "python -m benchmarks markers markers_synthetic docs/images/markers_synthetic.svg",
+    "depth_start.png": "python -m benchmarks.accuracy.depth.depth_real docs/images",
+    "markers_synthetic.svg": "python -m benchmarks.papers.markers.markers_synthetic docs/images/markers_synthetic.svg",
     "morphing_arm.svg": "python -m benchmarks silhouettes silhouettes_morphing",
     "morphing_torso.jpg": "python -m benchmarks silhouettes silhouettes_torso",
     "people_cases.jpg": "python -m benchmarks.accuracy.people.people_pictures docs/images/people_cases.jpg",

@@ -181,7 +181,7 @@ def test_the_house_does_not_grow(unit):
 
 
 def test_no_capability_is_lost():
-    assert not lost(), "\n".join([*lost(), "Bring it back, or list it in benchmarks/house/house_record.py with the reason."])
+    assert not lost(), "\n".join([*lost(), "Bring it back, or list it with the reason in house_record.py."])
 
 
 def public_without_docstring(body: list[ast.stmt], prefix: str = "") -> list[str]:

@@ -1,6 +1,7 @@
 """What kinefit can do, a line each: commands and options, keys of a take, formats, kinds of findings, public names.
 
-`python -m benchmarks.house.house_record` writes the record, `tests/capabilities.txt`; a test fails where a line is lost.
+`python -m benchmarks.house.house_record` writes the record, `tests/capabilities.txt`; a test fails where a line
+is lost.
 """
 
 from __future__ import annotations

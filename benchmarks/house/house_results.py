@@ -1,7 +1,7 @@
 """What the commands make of shared recordings, before and after a redesign: joints, angles, bars, findings, seconds.
 
-`python -m benchmarks.house.house_results write FILE` runs the commands with their defaults and writes the results of some
-frames; `python -m benchmarks.house.house_results compare FILE` runs them again and prints what differs.
+`python -m benchmarks.house.house_results write FILE` runs the commands with their defaults and writes the
+results of some frames; `python -m benchmarks.house.house_results compare FILE` runs them again and prints what differs.
 """
 
 from __future__ import annotations

@@ -12,13 +12,14 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from functools import cache
-from importlib import import_module
 
-from benchmarks import AREAS
+from benchmarks.areas import AREAS
 from benchmarks.figures import LEFT_OUT, ROOT, figure, quick
 
 ROWS = 57
 """Of the ledger: 48, and nine that were added."""
+
+AREA_OF_PART = {part: area for area, parts in AREAS.items() for part in parts if "_" in part}
 
 _ROW = re.compile(r"\| (P\d-\d+) \|")
 _WORD = re.compile(r"[a-z]\w*")
@@ -39,15 +40,7 @@ class Row:
         """What tries it, as words after `python -m`."""
         if not self.parts:
             return [("pytest", "-q", "-x", "-m", "slow or not slow", "-p", "no:cacheprovider", *self.tests)]
-        areas = areas_of_parts()
-        return [(f"benchmarks.{areas[part]}", part, "--quick", "--no-log") for part in self.parts]
-
-
-@cache
-def areas_of_parts() -> dict[str, str]:
-    """{part: area} of all benchmarks."""
-    areas = {area: getattr(import_module(f"benchmarks.{area}"), "PARTS", {}) for area in AREAS}
-    return {part: area for area, parts in areas.items() for part in parts if "_" in part}
+        return [("benchmarks", AREA_OF_PART[part], part, "--quick", "--no-log") for part in self.parts]
 
 
 def read_rows(text: str) -> list[Row]:
@@ -63,7 +56,7 @@ def read_rows(text: str) -> list[Row]:
         for where, name in _TEST.findall(cells[header.index("test")]):
             folder = where or folder
             tests.append(f"{folder}{name}" if folder.startswith("tests/") else f"tests/{folder}{name}")
-        parts = dict.fromkeys(word for word in _WORD.findall(line) if word in areas_of_parts())
+        parts = dict.fromkeys(word for word in _WORD.findall(line) if word in AREA_OF_PART)
         out.append(Row(found[1], tuple(parts), tuple(tests)))
     return out
 

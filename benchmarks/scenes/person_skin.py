@@ -1,4 +1,6 @@
-"""Make the skin of a person in figures: `python -m benchmarks.scenes.person_skin` writes `kinefit/data/person_skin.npz`.
+"""Make the skin of a person in figures.
+
+`python -m benchmarks.scenes.person_skin` writes `kinefit/data/person_skin.npz`.
 
 The humanoid's limbs get metaballs whose cross-sections follow the widths below, which are round figures of an average
 adult set by hand, no other model's. One seamless skin with weights is meshed over all of them

@@ -1,4 +1,4 @@
-"""Time of identification and fitting together, and of a large set's frames: `python -m benchmarks markers markers_speed`.
+"""Time of identification and fitting together, and of a large set's frames.
 
 Time is the processor's of one core, so that what else a machine does is not counted; compiled kernels are there.
 """

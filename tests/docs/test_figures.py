@@ -6,6 +6,7 @@ import subprocess
 import sys
 from datetime import date
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from benchmarks import figures, ledger
@@ -35,11 +36,10 @@ def records():
 
 @pytest.fixture
 def log(tmp_path, monkeypatch):
-    """A log of its own; figures are printed by a program of the benchmarks."""
+    """A log of its own; figures are printed by a whole run of a part."""
     monkeypatch.setattr(ledger, "LOG", tmp_path / "figures.csv")
     monkeypatch.setattr(ledger, "commit", lambda: "abc1234")
-    monkeypatch.setattr(sys, "argv", [str(ROOT / "benchmarks" / "solver.py")])
-    monkeypatch.setattr(figures, "_PART", [])
+    monkeypatch.setenv(figures.COMMAND, RUN)
     monkeypatch.delenv(figures.QUICK, raising=False)
     return tmp_path / "figures.csv"
 
@@ -66,7 +66,7 @@ def test_the_log_is_sorted_so_that_changes_are_read_as_lines(tmp_path):
 
 def test_names_on_the_page_are_printed_by_a_benchmark():
     patterns = set()
-    for path in (ROOT / "benchmarks").glob("*.py"):
+    for path in (ROOT / "benchmarks").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.JoinedStr):
                 parts = [re.escape(v.value) if isinstance(v, ast.Constant) else ".+" for v in node.values]
@@ -122,7 +122,7 @@ def test_a_whole_run_is_logged_and_replaces_the_last(log, capsys):
     figure("b", 2.5, "ms", "<= 2")
     found = read(log)
     assert list(found) == ["a", "b"]
-    told = "python -m benchmarks solver", "b", "2.5", "ms", "<= 2", "missed", "", date.today().isoformat(), "abc1234"
+    told = RUN, "b", "2.5", "ms", "<= 2", "missed", "", date.today().isoformat(), "abc1234"
     assert found["b"][:-1] == told
     assert "Python" in found["b"].machine and "numba" in found["b"].machine
     assert capsys.readouterr().out.split("\n")[0] == "figure b = 1.235 ms (goal <= 2): met"
@@ -130,14 +130,21 @@ def test_a_whole_run_is_logged_and_replaces_the_last(log, capsys):
 
 def test_what_is_no_whole_run_is_not_logged(log, monkeypatch):
     figure("a", 1.0, "ms", "<= 2", whole=False)
-    monkeypatch.setattr(sys, "argv", [sys.argv[0], "--no-log"])
-    figure("a", 1.0, "ms", "<= 2")
-    monkeypatch.setattr(sys, "argv", ["/bin/another"])
-    figure("a", 1.0, "ms", "<= 2")
-    monkeypatch.setattr(sys, "argv", [str(ROOT / "benchmarks" / "solver.py")])
     monkeypatch.setenv(figures.QUICK, "1")
     figure("a", 1.0, "ms", "<= 2")
+    monkeypatch.delenv(figures.QUICK)
+    figures.find_benchmarks()
+    figure("a", 1.0, "ms", "<= 2")
     assert not log.exists()
+
+
+@pytest.mark.parametrize("options", [[], ["--no-log"]])
+def test_a_part_is_logged_with_its_command(log, monkeypatch, options):
+    part = SimpleNamespace(run=lambda: figure("a", 1.0, "ms", "<= 2"))
+    monkeypatch.setattr(figures, "module_of", {"gait_events": part}.get)
+    monkeypatch.setenv("PYTHONPATH", "")
+    figures.run_parts("gait", options)
+    assert {r.command for r in read(log).values()} == set() if options else {"python -m benchmarks gait gait_events"}
 
 
 def test_what_was_not_measured_replaces_no_value(log, capsys):

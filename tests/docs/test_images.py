@@ -5,6 +5,7 @@ import importlib
 import sys
 
 import pytest
+from benchmarks.areas import AREAS
 from tests.conftest import ROOT
 from tests.docs.blocks import PAGES
 
@@ -33,10 +34,14 @@ def test_every_command_exists(draw):
     for image, module in draw.DRAWN.items():
         assert image.partition(".")[0] in functions(ROOT / "docs" / "drawing" / f"{module}.py"), image
     for image, command in draw.BENCHMARKS.items():
-        module, *parts = command.partition("benchmarks.")[2].split()
-        names = [part for part in parts if (ROOT / "benchmarks" / f"{part}.py").is_file()] or [module]
-        text = (ROOT / "benchmarks" / f"{names[0]}.py").read_text("utf-8")
-        assert "__main__" in (ROOT / "benchmarks" / f"{module}.py").read_text("utf-8"), command
+        program, *words = command.partition("python -m ")[2].split()
+        path = ROOT / f"{program.replace('.', '/')}.py"
+        if program == "benchmarks":
+            assert words[1] in AREAS[words[0]], command
+            (path,) = (ROOT / "benchmarks").rglob(f"{words[1]}.py")
+        else:
+            assert "__main__" in path.read_text("utf-8"), command
+        text = path.read_text("utf-8")
         stem, _, ending = image.partition(".")
         assert image in text or (f".{ending}" in text and stem.partition("_")[0] in text) or image in command, image
 

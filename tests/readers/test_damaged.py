@@ -73,7 +73,7 @@ def test_damage_is_the_same_in_every_run():
 def test_a_reader_that_fails_is_counted(tmp_path):
     code = (
         "import os, numpy as np\n"
-        "import benchmarks.robustness.fuzz.fuzz_readers as r, benchmarks.robustness.fuzz.fuzz_seeds as s, benchmarks.robustness.fuzz.fuzz_worker as w\n"
+        "from benchmarks.robustness.fuzz import fuzz_readers as r, fuzz_seeds as s, fuzz_worker as w\n"
         "def make(folder):\n"
         "    (folder / 'a').write_bytes(b'1')\n"
         "    whole = [True]\n"

@@ -1,8 +1,9 @@
 """Faces left open by `--hide-faces`: 300 images of all recordings with people, drawn by a seed, counted by eye.
 
-`python -m benchmarks.accuracy.detection.hide_faces FOLDER` writes the drawn images with faces hidden, as contact sheets; whoever looks at
-them enters what they count into `hide_faces.csv`: faces visible in the image as it was recorded (a head seen from
-behind or fully turned away is none, nor is a face that the recording has pixelated itself), and how many are open.
+`python -m benchmarks.accuracy.detection.hide_faces FOLDER` writes the drawn images with faces hidden, as
+contact sheets; whoever looks at them enters what they count into `hide_faces.csv`: faces visible in the image as it was
+recorded (a head seen from behind or fully turned away is none, nor is a face that the recording has pixelated itself),
+and how many are open.
 """
 
 from __future__ import annotations

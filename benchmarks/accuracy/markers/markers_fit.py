@@ -1,4 +1,4 @@
-"""Fitting of labelled markers beside references: Plug-in-Gait's model, OpenSim's: `python -m benchmarks markers markers_fit`.
+"""Fitting of labelled markers beside references: Plug-in-Gait's model and OpenSim's.
 
 Definitions differ, and no constant of ours is fitted to theirs. "As they are" compares plainly. "Aligned" takes out
 what cannot be a matter of right and wrong: where in its segment a model puts a joint's centre (one constant vector a

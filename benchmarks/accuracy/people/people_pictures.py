@@ -1,4 +1,6 @@
-"""Pictures of hard cases of several people, simulated: `python -m benchmarks.accuracy.people.people_pictures people.jpg`.
+"""Pictures of hard cases of several people, simulated.
+
+`python -m benchmarks.accuracy.people.people_pictures people.jpg` draws them.
 
 Each is tracked as by the command: keypoints of four cameras in half a circle, with 3 px of noise, 10 % outliers, 10 %
 missing. Grey are the detections of one camera, in colour the bodies that were fitted, each with its number.

@@ -131,7 +131,8 @@ def speed(frames: int = amount(500, 100)) -> None:
 def run() -> None:
     """Print every figure of smoothing."""
     one_core = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    subprocess.run([sys.executable, "-c", "from benchmarks.accuracy.video.smoothing import speed; speed()"], env=one_core, check=True)
+    call = f"from {__name__} import speed; speed()"
+    subprocess.run([sys.executable, "-c", call], env=one_core, check=True)
     folder = data(TRIAL)
     if folder is None:
         for name, unit, goal in (("acceleration_noise", "x", "<= 0.5"), ("residual", "px", "<= 9")):

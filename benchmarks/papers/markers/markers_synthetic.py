@@ -1,4 +1,4 @@
-"""The paper's synthetic test (P5 4.1) for SAPM as printed and for `identify`: `python -m benchmarks markers markers_synthetic`.
+"""The paper's synthetic test (P5 4.1) for SAPM as printed and for `identify`.
 
 Neither is told distortion, missing or extra. POSES poses a cell (200), CLEAN noise-free poses (2000). With a file's
 name (`... surface.svg`) it draws the surface of P5 Fig. 3 for both.

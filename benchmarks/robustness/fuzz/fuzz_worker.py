@@ -1,4 +1,6 @@
-"""One reader on damaged copies of its seed: `python -m benchmarks.robustness.fuzz.fuzz_worker READER FIRST COUNT`, a line a file.
+"""One reader on damaged copies of its seed, a line a file.
+
+`python -m benchmarks.robustness.fuzz.fuzz_worker READER FIRST COUNT` runs it.
 
 Lines: `at I` before a file is read, then `I KIND SECONDS MEGABYTES TEXT`; the process that started it stops what takes
 too long, and counts a process that ends amid a file as a crash. It ends before COUNT files where its memory has grown.

@@ -9,10 +9,9 @@ from __future__ import annotations
 import tempfile
 import traceback
 from collections.abc import Callable, Mapping
-from importlib import import_module
 from pathlib import Path
 
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import amount, data, figure, module_of
 
 MODULES = ("markers", "calibration", "skeletons", "pictures", "sides")
 """Modules `faults_users_*` with CASES and SIBLINGS: {name: whether the answer to what lies in a folder is right}."""
@@ -25,7 +24,7 @@ Answer = Callable[[Path], bool]
 
 def run() -> None:
     """Print the shares, and the names of what is wrong."""
-    modules = [import_module(f"benchmarks.faults_users_{name}") for name in MODULES]
+    modules = [module_of(f"faults_users_{name}") for name in MODULES]
     siblings = {name: answer for module in modules for name, answer in module.SIBLINGS.items()}
     siblings = dict(list(siblings.items())[: amount(None, 4)])
     with tempfile.TemporaryDirectory() as folder:
