@@ -1,0 +1,163 @@
+"""`docs/figures.md`, made of the log and of what `docs/figures.toml` says of it: `python -m benchmarks.page` writes it.
+
+A subject of the page takes the figures whose command begins with one of its `runs`. Figures whose names begin alike
+share a row of its table, in which each has a line of its own.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import date, timedelta
+from itertools import groupby
+from textwrap import shorten
+from typing import Any
+
+from benchmarks.figures import ROOT
+from benchmarks.ledger import BEFORE, LOG, Record, read
+
+PAGE, WORDS = ROOT / "docs" / "figures.md", ROOT / "docs" / "figures.toml"
+OLD = timedelta(weeks=4)
+_TOGETHER = 9
+"""Figures that share a row at most."""
+
+_LONG_UNIT = 32
+"""Letters of a unit from which on only its first words are shown."""
+
+_SIGNS = {"<=": "≤ ", ">=": "≥ ", ">": "> ", "==": ""}
+_UNITS = {"x": "×", "deg": "°"}
+_NO_BREAK = "\N{NO-BREAK SPACE}"
+
+
+def page(records: Mapping[str, Record], words: Mapping[str, Any]) -> str:
+    """The whole page.
+
+    Raises
+    ------
+    ValueError
+        Where a command of the log belongs to no subject, a meaning to no figure, or a sentence names what was not
+        measured.
+    """
+    newest = max(date.fromisoformat(record.date) for record in records.values())
+    names = figures_of_subjects(records, words["subject"])
+    parts = [words["head"].strip(), _table(("what", "figure", "goals"), _glance(records, words["glance"]))]
+    for subject in words["subject"]:
+        rows = [_cells(row, records, newest) for row in rows_of(names[subject["title"]])]
+        parts += [f"## {subject['title']}", " ".join(subject["text"].split()), *subject.get("images", [])]
+        parts.append(_table(("what", "value", "goal", "verdict", "run"), rows))
+        means = [f"`{name}`: {meaning}" for name, meaning in subject.get("means", {}).items()]
+        parts += ["<br>".join(means)] * bool(means)
+    retired = [(one["figures"], one["reason"]) for one in words.get("retired", [])]
+    parts += ["## Retired", _table(("figures", "why no benchmark prints them any more"), retired)]
+    return "\n\n".join(parts) + "\n"
+
+
+def figures_of_subjects(records: Mapping[str, Record], subjects: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
+    """{title: figures}, those that were never logged among them; the longest of all `runs` that fits decides."""
+    runs = {run: subject["title"] for subject in subjects for run in subject["runs"]}
+    found = {subject["title"]: [n for n in subject.get("waiting", []) if n not in records] for subject in subjects}
+    for record in records.values():
+        words = record.command.removeprefix("python -m benchmarks ") + " "
+        fitting = [run for run in runs if words.startswith(run + " ")]
+        if not fitting:
+            raise ValueError(f"docs/figures.toml: no subject has the runs of `{record.command}`")
+        found[runs[max(fitting, key=len)]].append(record.name)
+    for subject in subjects:
+        if unknown := subject.get("means", {}).keys() - {*found[subject["title"]]}:
+            raise ValueError(f"docs/figures.toml, {subject['title']}: no such figure: {', '.join(sorted(unknown))}")
+    return found
+
+
+def rows_of(names: Iterable[str]) -> list[list[str]]:
+    """Names in order, those that begin alike together, at most `_TOGETHER` in a row."""
+    return [row for _, group in groupby(sorted(names), _beginning(1)) for row in _parted([*group], 2)]
+
+
+def _beginning(words: int) -> Callable[[str], tuple[str, ...]]:
+    return lambda name: tuple(re.findall(r"[^_ ]+", name)[:words])
+
+
+def _parted(names: list[str], words: int) -> list[list[str]]:
+    """Parts of sorted names, by so many of their first words, and by more where they are still too many."""
+    if len(names) <= _TOGETHER:
+        return [names]
+    out: list[list[str]] = []
+    for _, group in groupby(names, _beginning(words)):
+        part = [*group]
+        if out and len(out[-1]) + len(part) <= _TOGETHER:
+            out[-1] += part
+        else:
+            out += _parted(part, words + 1)
+    return out
+
+
+def _cells(names: list[str], records: Mapping[str, Record], newest: date) -> tuple[str, ...]:
+    lines = [_line(name, records.get(name), newest) for name in names]
+    return tuple("<br>".join(cell) for cell in zip(*lines, strict=True))
+
+
+def _line(name: str, record: Record | None, newest: date) -> tuple[str, ...]:
+    """What stands in the columns of one figure, none of which is wrapped, so that they stay side by side."""
+    shown = f"`{name}`".replace(" ", _NO_BREAK)
+    if record is None:
+        return shown, "–", "–", "–", f"never{_NO_BREAK}logged"
+    verdict = f"**{record.verdict}**" if record.verdict == "missed" else record.verdict
+    state = ", more than four weeks old" if newest - date.fromisoformat(record.date) > OLD else ""
+    state += f", {BEFORE}" if record.reason == BEFORE else ""
+    cells = _value(record), _goal(record.goal), verdict, f"{record.date} {record.commit}{state}"
+    return shown, *(cell.replace(" ", _NO_BREAK) for cell in cells)
+
+
+def _value(record: Record) -> str:
+    if not record.value:
+        return "–"
+    unit = record.unit
+    if len(unit) > _LONG_UNIT:
+        unit = shorten(unit.partition(",")[0], _LONG_UNIT, placeholder=" …")
+    unit = re.sub(r"^(x|deg)(?!\w)", lambda found: _UNITS[found[1]], unit)
+    return f"{number(record.value)}{'' if unit.startswith('°') else ' '}{unit}".strip()
+
+
+def _goal(goal: str) -> str:
+    relation, bound = goal.split()
+    return _SIGNS[relation] + number(bound)
+
+
+def number(printed: str) -> str:
+    """As the page writes it: 12,340 for 1.234e+04, 8e-7 for 8e-07."""
+    if abs(float(printed)) >= 1000 and "." not in f"{float(printed):.6g}":
+        return f"{float(printed):,.0f}"
+    return printed.replace("e-0", "e-")
+
+
+def _glance(records: Mapping[str, Record], lines: Iterable[Mapping[str, str]]) -> list[tuple[str, ...]]:
+    """What to expect: sentences whose numbers are the log's, with the goals that are missed."""
+    table, last = [], ""
+    for line in lines:
+        named = re.findall(r"\{([^{}]+)\}", line["says"])
+        if absent := [name for name in named if name not in records or not records[name].value]:
+            raise ValueError(f"docs/figures.toml, glance: not measured: {', '.join(absent)}")
+        says = re.sub(r"\{([^{}]+)\}", lambda found: number(_short(records[found[1]].value)), line["says"])
+        missed = [_goal(records[name].goal) for name in named if records[name].verdict == "missed"]
+        verdict = f"**missed**: {', '.join(missed)}" if missed else "met"
+        table.append(("" if line["what"] == last else f"**{line['what']}**", says, verdict))
+        last = line["what"]
+    return table
+
+
+def _short(printed: str) -> str:
+    return printed if float(printed).is_integer() else f"{float(printed):.3g}"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows))
+
+
+def written() -> str:
+    """The page as log and words have it now."""
+    return page(read(LOG), tomllib.loads(WORDS.read_text("utf-8")))
+
+
+if __name__ == "__main__":
+    PAGE.write_text(written(), "utf-8")
