@@ -1,4 +1,4 @@
-"""The log of all figures, `docs/figures.csv`: `figure` writes to it in whole runs, `page` makes docs/figures.md of it."""
+"""The log of all figures, docs/figures.csv: `figure` writes to it in whole runs, `page` makes docs/figures.md of it."""
 
 from __future__ import annotations
 

@@ -20,11 +20,12 @@ WORDS = {
     "head": "# Figures",
     "glance": [{"what": "Solver", "says": "{speed} ms and {old}°"}],
     "subject": [
-        {"title": "Solver", "runs": ["solver"], "text": "Simulated,\nall.", "waiting": ["new"], "means": {"speed": "of legs"}},
+        {"title": "Solver", "runs": ["solver"], "text": "Simulated,\nall.", "waiting": ["new"],
+         "means": {"speed": "of legs"}},
         {"title": "Legs", "runs": ["solver legs"], "text": "Real.", "images": ["![Legs](images/legs.png)"]},
     ],
-    "retired": [{"figures": "`gone`", "reason": "nobody asked"}],
-}
+    "retired": [{"figures": "`gone`", "reason": "its goal is met by another"}],
+}  # fmt: skip
 
 
 def record_of(name, value, unit="ms", goal="<= 5", verdict="met", **more):
@@ -84,7 +85,8 @@ def test_names_on_the_page_are_printed_by_a_benchmark():
 
 
 def lines_of(title, text):
-    return text.partition(f"\n## {title}\n")[2].partition("\n## ")[0].strip().replace("\N{NO-BREAK SPACE}", " ").split("\n")
+    below = text.replace("\N{NO-BREAK SPACE}", " ").partition(f"\n## {title}\n")[2]
+    return below.partition("\n## ")[0].strip().split("\n")
 
 
 def test_every_figure_has_a_line_of_its_own_in_the_table_of_its_subject(records):
@@ -104,13 +106,14 @@ def test_every_figure_has_a_line_of_its_own_in_the_table_of_its_subject(records)
 def test_the_page_begins_with_sentences_of_the_log_and_ends_with_what_is_retired(records):
     text = page(records, WORDS)
     assert "| **Solver** | 4.5 ms and 2.7° | **missed**: ≤ 2 |" in text
-    assert text.endswith("| `gone` | nobody asked |\n")
+    assert text.endswith("| `gone` | its goal is met by another |\n")
 
 
 def test_figures_that_begin_alike_share_a_row_of_the_table(records):
     records |= {f"speed_{k}": record_of(f"speed_{k}", "1", "mm", "== 1") for k in range(3)}
     (row,) = [line for line in lines_of("Solver", page(records, WORDS)) if line.startswith("| `speed")]
-    assert row.count("<br>") == 5 * 3 and row.startswith("| `speed`<br>`speed_0`<br>`speed_1`<br>`speed_2` | 4.5 ms<br>1 mm")
+    assert row.count("<br>") == 5 * 3 and row.startswith("| `speed`<br>`speed_0`<br>`speed_1`<br>")
+    assert "| 4.5 ms<br>1 mm<br>1 mm<br>1 mm |" in row
 
 
 @pytest.mark.parametrize("count", [1, 9, 10, 40])

@@ -10,6 +10,7 @@ import os
 
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -158,3 +159,7 @@ def run(file: Path | None = None) -> None:
     table(model)
     if not quick():
         surface(model, file)
+
+
+if __name__ == "__main__":
+    run(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
