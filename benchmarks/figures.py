@@ -9,7 +9,7 @@ import shlex
 import sys
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import date
 from importlib import import_module
 from pathlib import Path
@@ -78,6 +78,44 @@ def data(name: str) -> Path | None:
     return root / name if (root / name).exists() else None
 
 
+class NotMeasured(Exception):
+    """Why a part, or a step of it, prints no figures: no recording, no program, or the quick form."""
+
+
+def recording(name: str) -> Path:
+    """Folder of a recording.
+
+    Raises
+    ------
+    NotMeasured
+        Where it is absent.
+    """
+    folder = data(name)
+    if folder is None:
+        raise NotMeasured(f"no recording {name}")
+    return folder
+
+
+def whole_recording(name: str) -> Path:
+    """As `recording`, of what the quick form leaves out."""
+    if quick():
+        raise NotMeasured(LEFT_OUT)
+    return recording(name)
+
+
+def each(*steps: Callable[[], object]) -> None:
+    """Run steps one after the other; one that cannot be measured says why, and the others go on."""
+    for step in steps:
+        try:
+            step()
+        except Exception as error:
+            from kinefit.errors import AssetError
+
+            if not isinstance(error, NotMeasured | AssetError):
+                raise
+            print(f"# not measured: {getattr(error, 'problem', error)}", flush=True)
+
+
 QUICK = "KINEFIT_BENCHMARKS_QUICK"
 """Set in the environment where `--quick` was asked for, so that processes that a part starts know it, too."""
 
@@ -141,7 +179,7 @@ def run_parts(area: str, words: Sequence[str]) -> None:
         if not options & {"--quick", "--no-log"}:
             log_as(area, name)
         try:
-            module_of(name).run()
+            each(module_of(name).run)
         except Exception:
             traceback.print_exc(file=sys.stdout)
             broken.append(name)

@@ -1,7 +1,7 @@
 """`docs/figures.md`, made of the log and of what `docs/figures.toml` says of it: `python -m benchmarks.page` writes it.
 
 A subject of the page takes the figures whose command begins with one of its `runs`. Figures whose names begin alike
-share a row of its table, in which each has a line of its own.
+share a row of its table, in which each has a line of its own; a run that all of them have in common stands once.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _LONG_UNIT = 32
 
 _SIGNS = {"<=": "≤ ", ">=": "≥ ", ">": "> ", "==": ""}
 _UNITS = {"x": "×", "deg": "°"}
-_NO_BREAK = "\N{NO-BREAK SPACE}"
+_NO_BREAK = str.maketrans({" ": "\N{NO-BREAK SPACE}", "-": "\N{NON-BREAKING HYPHEN}"})
 
 
 def page(records: Mapping[str, Record], words: Mapping[str, Any]) -> str:
@@ -93,20 +93,20 @@ def _parted(names: list[str], words: int) -> list[list[str]]:
 
 
 def _cells(names: list[str], records: Mapping[str, Record], newest: date) -> tuple[str, ...]:
-    lines = [_line(name, records.get(name), newest) for name in names]
-    return tuple("<br>".join(cell) for cell in zip(*lines, strict=True))
+    *columns, runs = zip(*(_line(name, records.get(name), newest) for name in names), strict=True)
+    return *map("<br>".join, columns), runs[0] if len({*runs}) == 1 else "<br>".join(runs)
 
 
 def _line(name: str, record: Record | None, newest: date) -> tuple[str, ...]:
     """What stands in the columns of one figure, none of which is wrapped, so that they stay side by side."""
-    shown = f"`{name}`".replace(" ", _NO_BREAK)
+    shown = f"`{name}`".replace(" ", " ".translate(_NO_BREAK))
     if record is None:
-        return shown, "–", "–", "–", f"never{_NO_BREAK}logged"
+        return shown, "–", "–", "–", "never logged".translate(_NO_BREAK)
     verdict = f"**{record.verdict}**" if record.verdict == "missed" else record.verdict
     state = ", more than four weeks old" if newest - date.fromisoformat(record.date) > OLD else ""
     state += f", {BEFORE}" if record.reason == BEFORE else ""
     cells = _value(record), _goal(record.goal), verdict, f"{record.date} {record.commit}{state}"
-    return shown, *(cell.replace(" ", _NO_BREAK) for cell in cells)
+    return shown, *(cell.translate(_NO_BREAK) for cell in cells)
 
 
 def _value(record: Record) -> str:
@@ -139,7 +139,7 @@ def _glance(records: Mapping[str, Record], lines: Iterable[Mapping[str, str]]) -
         if absent := [name for name in named if name not in records or not records[name].value]:
             raise ValueError(f"docs/figures.toml, glance: not measured: {', '.join(absent)}")
         says = re.sub(r"\{([^{}]+)\}", lambda found: number(_short(records[found[1]].value)), line["says"])
-        missed = [_goal(records[name].goal) for name in named if records[name].verdict == "missed"]
+        missed = [_goal(records[name].goal).translate(_NO_BREAK) for name in named if records[name].verdict == "missed"]
         verdict = f"**missed**: {', '.join(missed)}" if missed else "met"
         table.append(("" if line["what"] == last else f"**{line['what']}**", says, verdict))
         last = line["what"]

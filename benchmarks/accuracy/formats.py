@@ -14,13 +14,14 @@ import tempfile
 import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.accuracy.surfaces.retarget import validated
-from benchmarks.figures import LEFT_OUT, ROOT, figure, peers
+from benchmarks.figures import LEFT_OUT, ROOT, NotMeasured, each, figure, peers
 from benchmarks.peers.environments import run_peer
 from benchmarks.scenes.bags import Bag
 from kinefit import exporters
@@ -52,7 +53,7 @@ def run() -> None:
             except (ImportError, ExportError) as error:
                 told = (None, str(error))
             figure(f"formats_{name}", told[0], "m", GOAL, told[1])
-        _recorded(folder)
+        each(partial(_recorded, folder))
         _programs(motion, folder)
 
 
@@ -74,9 +75,7 @@ def _recorded(folder: Path) -> None:
             places.append(("rig", topic, T))
         file = bag.static(*places).write(folder / "bag")
     except ImportError as error:
-        for name in names:
-            figure(name, None, "", "> 0", str(error))
-        return
+        raise NotMeasured(str(error)) from error
     videos = [read_depth(file / topic / "depth" / "image") for topic in "abc"]
     off = [np.abs(video.frame(i).depth - metres[i]).max() for video in videos for i in range(5)]
     figure(names[0], float(max(off)), "m", "<= 1e-6")

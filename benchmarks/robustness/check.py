@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.accuracy.video.tracking import DETECTORS, NOISE, TRIAL, take_text
-from benchmarks.figures import data, figure
+from benchmarks.figures import each, figure, recording
 from benchmarks.scenes.motions import library
 from kinefit import Keypoints, Motion, Rig
 from kinefit.diagnostics.checks import Checked, check_keypoints
@@ -123,12 +123,5 @@ def mistakes() -> None:
 
 def run() -> None:
     """Print every figure of check."""
-    folder = data(TRIAL)
-    if folder is None:
-        for detector in DETECTORS:
-            figure(f"check_bias_found_{detector}", None, "px", ">= 8", "the real trial is absent")
-    else:
-        with tempfile.TemporaryDirectory() as where:
-            real_trial(folder, Path(where))
-    offsets()
-    mistakes()
+    with tempfile.TemporaryDirectory() as where:
+        each(lambda: real_trial(recording(TRIAL), Path(where)), offsets, mistakes)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import amount, figure, recording
 from kinefit import fit_marker_subject, fit_markers, load_body, read_markers
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.calibration.people.floor import centre_of_mass
@@ -48,15 +48,7 @@ def run() -> None:
 
 def squats() -> None:
     """1,346 frames of squats without gaps: the subject from this trial and a static one, as `kinefit markers fit`."""
-    folder = data("forces_nimblephysics")
-    if folder is None:
-        for name, unit, goal in (
-            ("second_call", "frames", "== 0"),
-            ("over_10mm", "frames", "== 0"),
-            ("jump", "g", "<= 6"),
-        ):
-            figure(f"faults_solver_squats_{name}", None, unit, goal, "the recording is absent")
-        return
+    folder = recording("forces_nimblephysics")
     static, take = (read_markers(folder / "subject4" / f"{name}.trc") for name in ("static1", "squats1"))
     subject = fit_marker_subject(load_body("humanoid"), [static, take])
     x = columns(take, subject.points.names)[: amount(None, 300)]

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.figures import amount, figure
+from benchmarks.figures import NotMeasured, amount, figure
 from benchmarks.speed.long import write_long_take
 from kinefit.batch.cluster import run_there
 from kinefit.batch.one import Choices, TakeJob
@@ -96,9 +96,8 @@ def overhead(takes: int) -> None:
     goal = ("ms", "<= 50")
     try:
         from distributed import LocalCluster
-    except ImportError:
-        figure("batch_dask_overhead_ms", None, *goal, "the extra cluster is not installed")
-        return
+    except ImportError as error:
+        raise NotMeasured("the extra cluster is not installed") from error
     jobs = [TakeJob(Path(f"s{k}/take.toml"), f"s{k}", Path(f"out/s{k}"), f"s{k}", Choices()) for k in range(takes)]
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0", protocol="tcp://") as cluster:
         began = time.monotonic()

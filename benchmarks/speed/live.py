@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import amount, data, figure, recording
 from kinefit.live.cameras import Arrived
 from kinefit.live.receivers.websocket import JsonLines, Vmc, WebSockets
 from kinefit.live.record import MotionRecord
@@ -125,12 +125,7 @@ def followed(folder, frames, rate, more=()):
 
 
 def run() -> None:
-    names = ("live_keypoints_p99", "live_uncounted", "live_detector_p99", "live_detector_rate", "live_hour_growth",
-             "live_hour_drift", "live_hour_uncounted")  # fmt: skip
-    if data(TRIAL) is None:
-        for name in names:
-            figure(name, None, "", "> 0", f"no recording {TRIAL}")
-        return
+    recording(TRIAL)
     with tempfile.TemporaryDirectory() as folder:
         session = followed(folder, amount(1200, 60), RATE)
         ms = 1e3 * np.array(session.latencies)

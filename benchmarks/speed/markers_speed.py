@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.figures import amount, figure
+from benchmarks.figures import NotMeasured, amount, each, figure
 from benchmarks.scenes.marker_takes import broken, load, shuffled
 from kinefit import Markers, fit_marker_subject, fit_markers, identify, identify_take, learn_model, load_body
 from kinefit.identification.model.model import MarkerModel
@@ -27,8 +27,7 @@ FRAMES = amount(20, 2)
 
 def run() -> None:
     """Print every figure."""
-    large_set()
-    whole_take()
+    each(large_set, whole_take)
 
 
 def large_set() -> None:
@@ -57,9 +56,7 @@ def whole_take() -> None:
     file = "mocaprecovery/data__85_12.c3d"
     taught, take = load((file, 0.0, 0.45)), load((file, 0.0, 1.0))
     if taught is None or take is None:
-        for name, goal in (("markers_60s", "<= 12"), ("markers_60s_smoothed", "<= 40")):
-            figure(name, None, "s", goal, "the recording is absent")
-        return
+        raise NotMeasured("the recording is absent")
     x = np.concatenate([take.positions, take.positions[::-1]])[: amount(7200, 200)]
     labelled = replace(take, positions=x, residual=None)
     model = learn_model(taught)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import NotMeasured, amount, data, figure
 from kinefit.exporters.c3d_file import write_markers
 from kinefit.motion import Motion
 from kinefit.readers.markers import read_markers
@@ -37,8 +37,7 @@ _OTHER_MEANS = 0.80, 1.00  # [m] of the club's length
 def run() -> None:
     """Print the figures."""
     if (file := data(FILE)) is None:
-        figure("golf swing: club length, standard deviation over its prior's", None, "of it", "<= 0.7", f"no {FILE}")
-        return
+        raise NotMeasured(f"no {FILE}")
     step = amount(2, 8)
     with tempfile.TemporaryDirectory() as folder:
         motion = swing(file, Path(folder), step)

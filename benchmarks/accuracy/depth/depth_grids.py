@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tests.bodies.surfaces.shapes import brute_force, points_on
 
-from benchmarks.figures import data, figure
+from benchmarks.figures import figure, recording
 from kinefit.bodies.surfaces import MeshSurface
 from kinefit.bodies.surfaces.closest._kernels_grid import nearest_on_grids
 from kinefit.bodies.surfaces.closest.grid import distance_grid, parts
@@ -30,11 +30,7 @@ GOALS = {
 
 def run() -> None:
     """Print the figures on the ten-part body's meshes."""
-    folder = data("scene_body10")
-    if folder is None:
-        for name, goal in GOALS.items():
-            figure(f"grid_{name}", None, name.rpartition("_")[2], goal, "no recording scene_body10")
-        return
+    folder = recording("scene_body10")
     meshes = {path.stem: mesh_surface(path, 0) for path in sorted((folder / "meshes").glob("*.obj"))}
     values = _errors(list(meshes.values())) | {"build_s": max(_build_time(m) for m in meshes.values())}
     values["nearest_5000x10_ms"] = 1e3 * _search_time(folder, meshes)

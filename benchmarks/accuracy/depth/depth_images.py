@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import time
 
-from benchmarks.figures import data, figure
+from benchmarks.figures import each, figure, recording
 
 _PEOPLE = 14  # in the twelve images of depth_skeltrack_kinect1: ten of one person, two of two
 
 
 def run() -> None:
     """Print the figures."""
-    _speed()
-    _count()
+    each(_speed, _count)
 
 
 def _speed() -> None:
     from kinefit import Camera, read_depth
     from kinefit.images.depth import clean, downsample, to_points
 
-    goal, folder = "<= 0.5", data("depth_sr305_upperbody")
-    if folder is None:
-        figure("depth_image_to_points_ms", None, "ms", goal, "no recording depth_sr305_upperbody")
-        return
+    goal, folder = "<= 0.5", recording("depth_sr305_upperbody")
     video = read_depth(folder / "20210326-231615", unit=0.000125)
     camera = Camera("sr305", video.size, [[476.007, 0, 313.683], [0, 476.007, 242.755], [0, 0, 1]])
     depth, best, count = video.frame(0).depth, float("inf"), 0
@@ -38,10 +34,7 @@ def _count() -> None:
     from kinefit.images.depth import clean
     from kinefit.images.depth_scene import people
 
-    goal, folder = "== 12", data("depth_skeltrack_kinect1")
-    if folder is None:
-        figure("depth_images_people_counted", None, "images", goal, "no recording depth_skeltrack_kinect1")
-        return
+    goal, folder = "== 12", recording("depth_skeltrack_kinect1")
     camera = Camera("kinect", (640, 480), [[575, 0, 319.5], [0, 575, 239.5], [0, 0, 1]])
     video = read_depth(folder, size=(640, 480))
     found = [len(people(clean(video.frame(i).depth, camera), camera)) for i in range(len(video))]

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import FAILED, amount, figure
+from benchmarks.figures import FAILED, NotMeasured, amount, figure
 from benchmarks.papers.regions.scene_body10 import (
     FOUND,
     LOST,
@@ -61,9 +61,7 @@ def run() -> None:
     """Print every figure of the scene."""
     plain, occluded = folder("body10"), folder("body10occl")
     if plain is None or occluded is None:
-        for name, unit, goal in _GOALS:
-            figure(name, None, unit, goal, "KINEFIT_SCENE names no folder with body10/ and body10occl/")
-        return
+        raise NotMeasured("KINEFIT_SCENE names no folder with body10/ and body10occl/")
     measured = _speed() | _accuracy(load_scene(plain), load_scene(occluded))
     for name, unit, goal in _GOALS:
         figure(name, measured.get(name), unit, goal, "its process failed")

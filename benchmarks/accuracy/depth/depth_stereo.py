@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import NotMeasured, amount, data, each, figure, recording
 from kinefit.bodies import load_body
 from kinefit.bodies.body_surfaces import sample
 from kinefit.correspondences import collision_rows, free_space_rows
@@ -31,10 +31,7 @@ SQUARE = 0.025  # [m]
 
 def run() -> None:
     """Print every figure."""
-    _board()
-    _head()
-    _skin()
-    _space()
+    each(_board, _head, _skin, _space)
 
 
 def _cpu(work: Callable[[], object], repeats: int = 100) -> float:
@@ -49,12 +46,8 @@ def _cpu(work: Callable[[], object], repeats: int = 100) -> float:
 
 
 def _board() -> None:
-    folder = data("stereo_opencv_chessboard")
+    folder = recording("stereo_opencv_chessboard")
     names = ("stereo board squares", "stereo board flatness", "stereo corners found", "stereo corners one period off")
-    if folder is None:
-        for name in names:
-            figure(name, None, "", "<= 1", "no recording")
-        return
     rig = read_opencv_stereo(folder / "intrinsics.yml", folder / "extrinsics.yml", unit=SQUARE, image_size=(640, 480))
     pair = StereoRectifier(*rig.cameras, near=0.2, far=1.5)
     squares, flat, found, beside = [], [], [], []
@@ -90,10 +83,7 @@ def _corners(pair: StereoRectifier, left: NDArray, right: NDArray) -> NDArray:
 
 def _head() -> None:
     """A walking person before a simulated stereo head, 3 m away."""
-    folder = data("motion_cmu_bvh")
-    if folder is None:
-        figure("stereo head, depth of the body", None, "px", "<= 0.25", "no recording")
-        return
+    folder = recording("motion_cmu_bvh")
     from kinefit.readers.skeletons.bvh import read_bvh
     from kinefit.simulation.rendering.scenes import STEREO, SimulatedScene, picture
     from kinefit.simulation.retarget import retarget
@@ -141,9 +131,7 @@ def _skin() -> None:
             raise FileNotFoundError("no recording")
         models = Models(assets.detector_models())
     except (KinefitError, FileNotFoundError) as error:
-        for name in names:
-            figure(name, None, "", "<= 1", str(error).split(".")[0])
-        return
+        raise NotMeasured(str(error).split(".")[0]) from error
     parts = [_gestures(folder, port, models) for port in (1, 2, 3)]
     off, cpu = np.concatenate([p[0] for p in parts]), float(np.median([p[1] for p in parts]))
     for k, (share, gap, goal) in enumerate(((names[0], names[1], "0.25"), (names[2], names[3], "0.35"))):

@@ -10,9 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.figures import amount, data, figure, quick
+from benchmarks.figures import amount, data, figure, quick, recording
 from kinefit.assets import CAMERAS
-from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.geometry.lines import triangulate
 from kinefit.images.detectors.roi import MIRROR
@@ -33,16 +32,8 @@ _RUNS = amount(3, 1)  # the fastest counts: other programs only slow it down
 
 def run() -> None:
     """Print every figure of the built-in detector."""
-    trial, seated = data("video_balancing_4cam"), data("mv4_upperbody_caliscope")
-    try:
-        detecting.networks(None, print)
-        missing = "" if trial else "no recording"
-    except (AssetError, ObservationError) as error:
-        missing = error.problem
-    if missing or trial is None:
-        for name, (unit, goal) in _GOALS.items():
-            figure(name, None, unit, goal, missing)
-        return
+    trial, seated = recording("video_balancing_4cam"), data("mv4_upperbody_caliscope")
+    detecting.networks(None, print)
     with tempfile.TemporaryDirectory() as folder:
         _trial(trial, Path(folder))
         if seated is not None and not quick():

@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.accuracy.detection.detect_quality import held_out
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import amount, figure, recording
 from kinefit import load_body
-from kinefit.errors import AssetError, ObservationError
 from kinefit.images.detectors.box_detector import Models
 from kinefit.images.detectors.detection import detect_people
 from kinefit.images.detectors.faces import HEAD, FaceFinder, FaceModels
@@ -46,15 +45,7 @@ class _TimedFinder(FaceFinder):
 
 def run() -> None:
     """Print every figure of the detector of faces."""
-    folder = data("mv4_upperbody_caliscope")
-    try:
-        if folder is None:
-            raise ObservationError("no recording")
-        networks = detecting.networks(None, print, "best")
-    except (AssetError, ObservationError) as error:
-        for name, (unit, goal) in _GOALS.items():
-            figure(name, None, unit, goal, error.problem)
-        return
+    folder, networks = recording("mv4_upperbody_caliscope"), detecting.networks(None, print, "best")
     found = [_detect(networks, folder / f"port_{k}.mp4") for k in range(4)]
     rig = read_calibration(folder / "config.toml")
     face = np.stack([np.where((d.face_confidence[:, 0] > 0)[..., None], d.face[:, 0], np.nan) for d in found], axis=2)

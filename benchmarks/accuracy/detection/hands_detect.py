@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import data, figure, quick
-from kinefit.errors import AssetError, ObservationError
+from benchmarks.figures import figure, quick, recording
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.lines import triangulate
 from kinefit.images.detectors.box_detector import Models
@@ -32,15 +31,7 @@ _FRAMES = 60  # of the quick form
 
 def run() -> None:
     """Print every figure of the detector of hands."""
-    folder = data("stereo_arm_handpose3d")
-    try:
-        if folder is None:
-            raise ObservationError("no recording")
-        networks = detecting.networks(None, print).folder
-    except (AssetError, ObservationError) as error:
-        for name, (unit, goal) in _GOALS.items():
-            figure(name, None, unit, goal, error.problem)
-        return
+    folder, networks = recording("stereo_arm_handpose3d"), detecting.networks(None, print).folder
     hands, confidences, spent = zip(*(_detect(networks, folder / f"cam{k}_test.mp4") for k in (0, 1)))
     seen = [(c > _MIN_CONFIDENCE).any(axis=2) for c in confidences]  # (F, 2) left, right
     counts = sum(s.sum(axis=0) for s in seen)

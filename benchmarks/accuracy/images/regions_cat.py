@@ -16,7 +16,7 @@ import numpy as np
 from click.testing import CliRunner
 from numpy.typing import NDArray
 
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import amount, figure, recording
 from benchmarks.scenes.regions_scene import away, rigid, state_of
 from kinefit.bodies import Body
 from kinefit.bodies.surfaces.mesh import read_obj
@@ -70,13 +70,8 @@ def timed(body: Body, rig: Rig, seen: list[NDArray], first: NDArray) -> tuple[ND
 
 def run() -> None:
     """Print how many images are right, how far the poses are off, and the time of one."""
-    folder = data("region_cat")
+    folder = recording("region_cat")
     names = {every: f"cat, every {every}. image: right" if every > 1 else "cat, every image: right" for every in GOALS}
-    if folder is None:
-        for every, goal in GOALS.items():
-            figure(names[every], None, "images", goal, "no recording region_cat")
-        figure(SMOOTHED, None, "images", ">= 29", "no recording region_cat")
-        return
     seen = images(folder)
     true = truth(folder, len(seen))
     print("# kinefit track --realtime, [start] is the true pose, no resets; the truth is good to 5.5 mm, 2.4 degrees")

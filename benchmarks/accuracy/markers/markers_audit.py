@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import NotMeasured, amount, data, each, figure
 from benchmarks.scenes.marker_takes import put_right
 from kinefit.bodies.marker_sets import find_marker_set
 from kinefit.identification.audit.audit import audit_take
@@ -136,7 +136,7 @@ def run() -> None:
         figure(title, value if markers else None, "found", "== 1", why)
     one_frame()
     in_gaps()
-    gappy()
+    each(gappy)
     flip, subject4 = take(FLIP), take(SUBJECT4)
     found = audit_take(flip, model=learn_model(subject4)) if flip and subject4 else []
     for f in found:
@@ -224,8 +224,7 @@ def gappy() -> None:
     """Time of the longest take with forty gaps of 1 to 30 frames a marker and fifteen exchanges of 5 to 200 frames."""
     markers, rng = clean(CLEAN[0]), np.random.default_rng(0)
     if markers is None:
-        figure("audit_seconds_gaps_and_swaps", None, "s CPU", "<= 5", "no recordings: set KINEFIT_DATA")
-        return
+        raise NotMeasured("no recordings: set KINEFIT_DATA")
     x = np.array(markers.positions)
     for k in range(x.shape[1]):
         for _ in range(40):

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import LEFT_OUT, amount, data, figure, peers, quick
+from benchmarks.figures import LEFT_OUT, amount, each, figure, peers, quick, recording
 from benchmarks.peers.environments import run_peer
 from kinefit import Markers, Motion, load_body, read_markers
 from kinefit.cli.markers._fit import worn_body
@@ -46,11 +46,7 @@ PEOPLE = 6
 
 def run() -> None:
     """Print every figure of marker fitting."""
-    plug_in_gait()
-    opensim()
-    landmarks()
-    known_person()
-    long_take()
+    each(plug_in_gait, opensim, landmarks, known_person, long_take)
 
 
 def fitted(trials: list[Markers]) -> tuple[MarkerSubject, Motion]:
@@ -62,11 +58,7 @@ def fitted(trials: list[Markers]) -> tuple[MarkerSubject, Motion]:
 def plug_in_gait() -> None:
     """The movement trial of pyCGM's sample, with the joint centres and angles that Vicon's model put in the file."""
     names = ("markers_pycgm_centres", "mm", "<= 15"), ("markers_pycgm_sagittal", "deg", "<= 4")
-    folder = data("markers_pycgm")
-    if folder is None:
-        for name, unit, goal in names:
-            figure(name, None, unit, goal, "the recording is absent")
-        return
+    folder = recording("markers_pycgm")
     path = folder / "Test_Files" / "Movement_trial.c3d"
     markers = read_markers(path)
     subject, motion = fitted([markers])
@@ -108,11 +100,7 @@ def opensim() -> None:
         "markers_bmc_rms_vs_opensim": ("x", "<= 1"), "markers_fit_vs_opensim": ("x faster", ">= 50"),
         "markers_fit_vs_opensim_own": ("x faster", ">= 50"),
     }  # fmt: skip
-    folder = data("markers_bmc_run")
-    if folder is None:
-        for name, (unit, goal) in figures.items():
-            figure(name, None, unit, goal, "the recording is absent")
-        return
+    folder = recording("markers_bmc_run")
     trials = [read_markers(folder / "run" / "ExpData" / f"{n}.trc") for n in ("static_run", "motion_capture_run")]
     subject, motion = fitted(trials)
     names, table = read_mot(folder / "run" / "IK" / "results" / "ik_output_run.mot")
@@ -166,10 +154,7 @@ def opensim() -> None:
 def landmarks() -> None:
     """Knees and ankles against the middle of epicondyles and malleoli of static trials, whose medial markers the fit
     never saw."""
-    folder = data("markers")
-    if folder is None:
-        figure("markers_landmark_centres", None, "mm", "<= 15", "the recordings are absent")
-        return
+    folder = recording("markers")
     means = []
     for name, static, moving, ends in two_laboratories(folder):
         medial = {pair[1] for pair in ends.values()}
@@ -228,10 +213,7 @@ def known_person() -> None:
 
 def long_take() -> None:
     """60 s at 120 Hz of 41 markers: a break dancer's take, forwards and then backwards."""
-    folder = data("markers")
-    if folder is None:
-        figure("markers_fit_60s", None, "s", "<= 30", "the recording is absent")
-        return
+    folder = recording("markers")
     take = read_markers(folder / "mocaprecovery" / "data__85_12.c3d")
     x = np.concatenate([take.positions, take.positions[::-1]])[: amount(7200, 400)]
     markers = replace(take, positions=x, residual=None)

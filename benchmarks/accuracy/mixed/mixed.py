@@ -17,11 +17,12 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
+from functools import partial
 
 from benchmarks.accuracy.mixed import mixed_doubt, mixed_figures
 from benchmarks.accuracy.mixed.mixed_runs import MIXES, track_draws
 from benchmarks.accuracy.mixed.mixed_takes import RATE, SECONDS
-from benchmarks.figures import figure, find_benchmarks, log_as, module_of, turned
+from benchmarks.figures import each, figure, find_benchmarks, log_as, module_of, turned
 from kinefit.assets import anny_files
 from kinefit.errors import AssetError
 
@@ -77,4 +78,4 @@ def main(words: Sequence[str]) -> None:
             SIMULATED[group](outcomes)
     for group in (name for name in groups if name not in SIMULATED):
         print(f"\n# {group}", flush=True)
-        module_of(f"mixed_{group}").run(quick=told.quick)
+        each(partial(module_of(f"mixed_{group}").run, quick=told.quick))

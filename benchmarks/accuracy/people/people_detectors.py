@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.accuracy.video.tracking import Trial, read_trial
-from benchmarks.figures import LEFT_OUT, data, figure, quick
+from benchmarks.figures import LEFT_OUT, each, figure, quick, whole_recording
 from benchmarks.scenes.held_out import cameras_left_out, median, persons
 from benchmarks.scenes.motions import library
 from kinefit import Keypoints, Motion, load_body
@@ -35,7 +35,7 @@ _GOALS = {"openpose": "<= 12", "mediapipe": "<= 13"}  # px
 
 def run() -> None:
     """Print every figure."""
-    _real()
+    each(_real)
     for ratio in _RATIOS:
         name, goal = f"people_two_detectors_simulated_{ratio}", "x the better one's joints"
         cases = [] if quick() else [(m, s) for m in library(list(SIMULATED)).values() for s in range(_SEEDS)]
@@ -97,13 +97,7 @@ def _shifted(truth: Motion, seen: Sequence[Keypoints], shift: NDArray) -> list[K
 
 
 def _real() -> None:
-    folder = data("video_balancing_4cam")
-    reason = "no recording" if folder is None else LEFT_OUT if quick() else ""
-    if reason or folder is None:
-        for name, goal in _GOALS.items():
-            figure(f"people_held_out_{name}", None, "px", goal, reason)
-        figure("people_two_detectors", None, "x the better one, its own keypoints held out", "<= 1", reason)
-        return
+    folder = whole_recording("video_balancing_4cam")
     with tempfile.TemporaryDirectory() as where:
         trials = {name: read_trial(folder, name, Path(where)) for name in DETECTORS}
     by_itself = {name: _held_out([trials[name]], trials[name]) for name in DETECTORS}

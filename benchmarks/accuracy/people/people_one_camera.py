@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import data, figure, quick
+from benchmarks.figures import NotMeasured, data, figure, quick
 from kinefit import Motion, load_body, read_motion
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry import se3
@@ -62,9 +62,7 @@ def run() -> None:
     except (AssetError, ObservationError) as error:
         root, missing = None, error.problem
     if root is None:
-        for name, (unit, goal) in _GOALS.items():
-            figure(name, None, unit, goal, missing)
-        return
+        raise NotMeasured(missing)
     errors = []
     for trial in _TRIALS[1:] if quick() else _TRIALS:
         with tempfile.TemporaryDirectory() as folder:

@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import data, figure, quick
+from benchmarks.figures import figure, whole_recording
 from kinefit import load_body
-from kinefit.errors import AssetError, ObservationError
 from kinefit.preparing import detecting
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import Observations, load_observations
@@ -36,18 +35,8 @@ ACCURACY = 8.0  # px, as `kinefit track` takes it for the built-in detector
 
 def run() -> None:
     """Print every figure."""
-    two, one = data("video_two_people_4cam"), data("video_balancing_4cam")
-    try:
-        detecting.networks(None, print)
-        missing = "left out of the quick form: eight videos are looked through" if quick() else ""
-    except (AssetError, ObservationError) as error:
-        missing = error.problem
-    if two is None or one is None:
-        missing = "no recording"
-    if missing or two is None or one is None:
-        for name, (unit, goal) in _GOALS.items():
-            figure(name, None, unit, goal, missing)
-        return
+    two, one = whole_recording("video_two_people_4cam"), whole_recording("video_balancing_4cam")
+    detecting.networks(None, print)
     with tempfile.TemporaryDirectory() as folder:
         _both(two, one, Path(folder))
 

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy.people.people_crowds import RATE, SET, _along, _hidden, _together
 from benchmarks.accuracy.people.people_real import take_of
-from benchmarks.figures import amount, data, figure, quick
+from benchmarks.figures import amount, each, figure, quick, whole_recording
 from kinefit.bodies import Body, load_body
-from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.motion import Motion
 from kinefit.multiview.likeness import ImageSource, joints_of
@@ -180,15 +179,8 @@ def judged(seen: Scene, people: list[PersonTrack]) -> tuple[int, int, int]:
 def _real() -> None:
     """The two people of four real videos, cut: both vanish for so long, and lists then have them in another order."""
     name, unit, goal = "people_return_real", "of 2 people and 2 absences known again", "== 4"
-    videos = data("video_two_people_4cam")
-    try:
-        detecting.networks(None, print)
-        missing = "left out of the quick form: four videos are looked through" if quick() else ""
-    except (AssetError, ObservationError) as error:
-        missing = error.problem
-    if missing or videos is None:
-        figure(name, None, unit, goal, missing or "no recording")
-        return
+    videos = whole_recording("video_two_people_4cam")
+    detecting.networks(None, print)
     known = 0
     with tempfile.TemporaryDirectory() as folder:
         take = prepared(read_take(take_of(videos, videos / "Calib.qca.txt", Path(folder) / "two")))
@@ -226,7 +218,7 @@ def _is_same(whole: PersonTrack, cut: PersonTrack, records: list[Keypoints], hal
 
 def run() -> None:
     """Print every figure."""
-    _real()
+    each(_real)
     of: dict[tuple[str, bool], NDArray] = {}
     by: dict[str, Callable[[Scene], ImageSource | None]] = {
         "size": lambda s: None, "size and clothes": lambda s: s.pictures,

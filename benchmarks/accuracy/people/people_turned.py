@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from benchmarks.accuracy.mixed import mixed_takes as takes
 from benchmarks.accuracy.mixed.mixed_cameras import errors
 from benchmarks.accuracy.video.tracking import read_trial
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import amount, each, figure, recording
 from kinefit import Recording, load_body
 from kinefit.errors import AssetError
 from kinefit.geometry import se3
@@ -44,7 +44,7 @@ OFF_DRAWS, OFF_FIRST, OFF_FRAMES = 20, 40, 60
 
 def run() -> None:
     """Print every figure."""
-    _real()
+    each(_real)
     for times in (3, 6):
         _all_off(times, range(OFF_FIRST, OFF_FIRST + amount(OFF_DRAWS, 1)))
 
@@ -75,19 +75,14 @@ def _all_off(times: int, draws: range) -> None:
 
 
 def _real() -> None:
-    folder = data("video_balancing_4cam")
-    if folder is None:
-        for kind in ("turned", "turned_any_axis"):
-            for name, (unit, goal) in _GOALS.items():
-                figure(f"people_{kind}_{name}", None, unit, goal, "no recording")
-        return
+    folder = recording("video_balancing_4cam")
     with tempfile.TemporaryDirectory() as where:
-        recording = read_trial(folder, "openpose", Path(where)).recording
-    names = recording.rig.names
+        made = read_trial(folder, "openpose", Path(where)).recording
+    names = made.rig.names
     y = np.array([0.0, 1.0, 0.0])
-    _figures("turned", recording, [(name, y) for name in amount(names, names[:1])])
+    _figures("turned", made, [(name, y) for name in amount(names, names[:1])])
     draws = [np.random.default_rng([32, FIRST + draw]) for draw in range(amount(DRAWS, 1))]
-    _figures("turned_any_axis", recording, [(names[r.integers(len(names))], _axis(r)) for r in draws])
+    _figures("turned_any_axis", made, [(names[r.integers(len(names))], _axis(r)) for r in draws])
 
 
 def _axis(random: np.random.Generator) -> NDArray:

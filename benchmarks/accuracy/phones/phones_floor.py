@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from benchmarks.accuracy.people import people_one_camera
 from benchmarks.accuracy.phones import phones_rooms
 from benchmarks.accuracy.phones.phones_real import RECORDINGS, _tracked
-from benchmarks.figures import amount, data, figure, quick
+from benchmarks.figures import amount, each, figure, recording, whole_recording
 from kinefit import Motion, find_cameras, track_take
 from kinefit.errors import KinefitError
 from kinefit.findings import runs_of
@@ -39,18 +39,12 @@ _GOALS = {
 
 def run() -> None:
     """Print every figure of floors."""
-    _of_walk()
-    _of_rooms()
-    _of_balancing()
+    each(_of_walk, _of_rooms, _of_balancing)
 
 
 def _of_walk() -> None:
-    root = data("video_mono_opencap")
+    root = recording("video_mono_opencap")
     units = {"tilt": "deg off the markers' vertical", "plane": "mm, the highest ankle of a stance above the lowest"}
-    if root is None:
-        for name, goal in (("tilt", "<= 1"), ("plane", "<= 15"), ("slide", "<= 5")):
-            figure(f"phones_floor_walk_{name}", None, units.get(name, _GOALS["slide"][0]), goal, "no recording")
-        return
     trial = root / "walk_ts"
     with tempfile.TemporaryDirectory() as work:
         shutil.copy(trial / "video.mp4", Path(work, "walk.mp4"))
@@ -110,11 +104,8 @@ def _of_room(draw: phones_rooms.Room, cameras: int | None) -> dict[str, float]:
 
 
 def _of_balancing() -> None:
-    recording, videos, calibration = RECORDINGS["balancing"]
-    folder, unit = data(recording), "deg off the calibration's vertical"
-    if folder is None or quick():
-        figure("phones_floor_balancing_tilt", None, unit, "<= 1", "no recording")
-        return
+    name, videos, calibration = RECORDINGS["balancing"]
+    folder, unit = whole_recording(name), "deg off the calibration's vertical"
     with tempfile.TemporaryDirectory() as work:
         _, motion, known = _tracked(folder / videos, folder / calibration, Path(work))
     frames = min(len(motion), len(known))

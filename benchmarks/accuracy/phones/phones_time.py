@@ -13,10 +13,9 @@ from pathlib import Path
 import av
 import numpy as np
 
-from benchmarks.figures import data, figure, quick
+from benchmarks.figures import figure, whole_recording
 from kinefit import Motion, track_take
 from kinefit.assets import CAMERAS
-from kinefit.errors import AssetError, ObservationError
 from kinefit.preparing import detecting
 from kinefit.readers.guess.folder import guess_take
 
@@ -29,15 +28,8 @@ Keep = Callable[[int, int], bool]
 
 def run() -> None:
     """Print every figure."""
-    trial, missing = data("video_balancing_4cam"), "no recording"
-    try:
-        detecting.networks(None, print)
-    except (AssetError, ObservationError) as error:
-        trial, missing = None, error.problem
-    if trial is None or quick():
-        for name, goal in _GOALS.items():
-            figure(name, None, "mm", goal, missing if trial is None else "left out of the quick form")
-        return
+    trial = whole_recording("video_balancing_4cam")
+    detecting.networks(None, print)
     with tempfile.TemporaryDirectory() as folder:
         whole = _tracked(trial, Path(folder) / "whole", {})
         all_lost = _tracked(trial, Path(folder) / "all", dict.fromkeys(CAMERAS, _without_middle))

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import LEFT_OUT, amount, data, figure, peers, quick
+from benchmarks.figures import LEFT_OUT, amount, figure, peers, quick, recording
 from benchmarks.peers.environments import run_peer
 from kinefit.photogrammetry.least_squares_matching import Matches
 from kinefit.photogrammetry.region_growing import Grid, Seeds, grow
@@ -51,11 +51,7 @@ class Sample:
 
 def run() -> None:
     """Print every figure."""
-    folder = data("dic_challenge_14")
-    if folder is None:
-        for window in WINDOWS:
-            figure(f"dic_systematic_{window}_against_pyvale", None, "", "<= 1.02", "no recording")
-        return
+    folder = recording("dic_challenge_14")
     sample = Sample(folder)
     _against_pyvale(sample)
     _resolution(sample)

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import amount, figure, recording
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
 from kinefit.photogrammetry.region_growing import Grid, grow
@@ -30,16 +30,11 @@ SPECKLE = slice(430, 2180), slice(720, 1620)  # of the first photograph
 WINDOW, STEP = 31, 8
 GAUGE = amount(0.005, 0.01)  # [m] of strain: five windows
 SQUARE = 0.01  # [m]
-NAMES = ("cylinder_points", "cylinder_radius_error", "cylinder_mad", "cylinder_points_a_second")
 
 
 def run() -> None:
     """Print every figure."""
-    folder = data("stereo_dic_cylinder")
-    if folder is None:
-        for name in NAMES:
-            figure(name, None, "", "<= 1", "no recording")
-        return
+    folder = recording("stereo_dic_cylinder")
     objects = [calibration_object(folder, name) for name in CAMERAS]
     rig = Rig(tuple(calibrated(folder, name, *seen) for name, seen in zip(CAMERAS, objects)))
     states = [

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.accuracy.surfaces.lsm import Texture
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import amount, figure, recording
 from benchmarks.papers.silhouettes.silhouettes_arm import SKIN, camera
 from kinefit.errors import KinefitError
 from kinefit.exporters.surface_files import write_field_picture
@@ -137,10 +137,7 @@ def _drift(paths: Trajectories) -> tuple[NDArray, float]:
 
 
 def _arm() -> None:
-    folder = data("stereo_arm_handpose3d")
-    if folder is None:
-        figure("surface_arm_live_points", None, "points", ">= 500", "no recording stereo_arm_handpose3d")
-        return
+    folder = recording("stereo_arm_handpose3d")
     rig, most = Rig((camera(folder, 0), camera(folder, 1))), 0
     for frame in amount((5, 60, 110, 160, 200, 250, 300), (160,)):
         told = [_seen(folder / f"cam{k}_test.mp4", frame) for k in range(2)]

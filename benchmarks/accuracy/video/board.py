@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import NotMeasured, amount, data, each, figure, recording
 from kinefit.calibration.board.calibrate import BoardCalibration, calibrate_board
 from kinefit.calibration.board.detection import Board
 from kinefit.calibration.board.sources import camera_sources, find_boards
@@ -19,24 +19,18 @@ _WEBCAMS = {"mv4_upperbody_caliscope": "", "mv4_landmarks_caliscope": "calibrati
 
 def run() -> None:
     """Print the figures."""
-    _stereo()
+    each(_stereo)
     results = {name: _webcams(name, inner) for name, inner in list(_WEBCAMS.items())[amount(0, 1) :]}
     measured = [result for result in results.values() if result is not None]
     if not measured:
-        for name, unit, goal in (("rms", "px", "<= 1"), ("view_rms", "px", "<= 0.5"), ("distances", "%", "<= 2")):
-            figure(f"board_mv4_{name}", None, unit, goal, "the recordings are absent")
-        return
+        raise NotMeasured("the recordings are absent")
     figure("board_mv4_rms", max(found.rms_px for found, _ in measured), "px", "<= 1")
     figure("board_mv4_view_rms", max(found.own_rms_px for found, _ in measured), "px", "<= 0.5")
     figure("board_mv4_distances", max(_distances(*result) for result in measured), "%", "<= 2")
 
 
 def _stereo() -> None:
-    folder = data("stereo_opencv_chessboard")
-    if folder is None:
-        for name, unit, goal in (("focal", "%", "<= 1"), ("baseline", "%", "<= 1"), ("rms", "px", "<= 0.5")):
-            figure(f"board_stereo_{name}", None, unit, goal, "the recording is absent")
-        return
+    folder = recording("stereo_opencv_chessboard")
     reference = read_calibration(folder, image_size=(640, 480), unit=0.025)
     board, seen = find_boards(camera_sources([folder]), Board.parse("checkerboard:9x6:0.025"))
     found = calibrate_board(seen, board)

@@ -25,7 +25,7 @@ from benchmarks.accuracy.video.tracking import (
     middle,
     read_trial,
 )
-from benchmarks.figures import LEFT_OUT, amount, data, figure, quick
+from benchmarks.figures import amount, each, figure, whole_recording
 from benchmarks.scenes.motions import library
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, track
 from kinefit.calibration.people.calibrate import calibrate_people
@@ -171,12 +171,5 @@ def synthetic() -> None:
 
 def run() -> None:
     """Print every figure of calibration from people."""
-    folder = data(TRIAL)
-    if folder is None or quick():
-        absent = LEFT_OUT if quick() else "the real trial is absent"
-        for detector in DETECTORS:
-            figure(f"refine_residual_{detector}", None, "px", f"<= {RESIDUAL[detector]:g}", absent)
-    else:
-        with tempfile.TemporaryDirectory() as where:
-            real_trial(folder, Path(where))
-    synthetic()
+    with tempfile.TemporaryDirectory() as where:
+        each(lambda: real_trial(whole_recording(TRIAL), Path(where)), synthetic)

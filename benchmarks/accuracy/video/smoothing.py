@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.accuracy.video.tracking import NOISE, TRIAL, median_residual, read_trial
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import amount, each, figure, recording
 from benchmarks.scenes.motions import library
 from kinefit import Motion, Recording, load_body, read_markers, track
 from kinefit.bodies import PointSet
@@ -133,11 +133,6 @@ def run() -> None:
     one_core = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     call = f"from {__name__} import speed; speed()"
     subprocess.run([sys.executable, "-c", call], env=one_core, check=True)
-    folder = data(TRIAL)
-    if folder is None:
-        for name, unit, goal in (("acceleration_noise", "x", "<= 0.5"), ("residual", "px", "<= 9")):
-            figure(f"smooth_{name}", None, unit, goal, "the real trial is absent")
-    else:
-        real_trial(folder)
+    each(lambda: real_trial(recording(TRIAL)))
     for keypoint_set in amount(("BODY_25B", "MEDIAPIPE_33"), ("MEDIAPIPE_33",)):
         synthetic(keypoint_set)

@@ -95,7 +95,6 @@ def errors(name: str, whole: Sequence[Followed], hidden: Sequence[Followed]) -> 
         figure(f"{name}_regions{key}_tracked", right[0], "% of frames", ">= 100")
         print(f"  without closures: {loose.mean():.1f} mm, {right[1]:.1f} % of frames")
     if not hidden:
-        figure(f"{name}_regions_hidden_leg", None, "of that without closures", "<= 0.5", LEFT_OUT)
         return
     closed, loose = (float(np.mean([f.leg(m) for f, m in pairs])) for pairs in (
         [(f, f.closed) for f in hidden], [(f, f.loose) for f in hidden]))  # fmt: skip

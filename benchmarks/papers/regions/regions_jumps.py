@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.accuracy.closures.closures_people import gap, left, own_circle, rms
-from benchmarks.figures import LEFT_OUT, amount, figure, quick
+from benchmarks.figures import LEFT_OUT, NotMeasured, amount, figure, quick
 from benchmarks.papers.regions.gear_takes import GearTake, rendered_cyclist, rendered_snowboarder
 from benchmarks.papers.regions.regions_gear import IMAGES, TRACKED, Followed, drawn, followed
 from kinefit.geometry import se3
@@ -39,9 +39,7 @@ def run() -> None:
     for cameras in amount(CAMERAS, CAMERAS[:1]):
         cyclists([cyclist(seed, cameras) for seed in amount(SEEDS, SEEDS[:1])], cameras)
     if quick():
-        for name in ("jump: rise of the board", "rider who rises: mean joint error with closures"):
-            figure(name, None, "mm", ">= 0", LEFT_OUT)
-        return
+        raise NotMeasured(LEFT_OUT)
     for cameras in CAMERAS:
         jumps([jump(seed, cameras) for seed in SEEDS], cameras)
     risers([riser(seed, CAMERAS[0]) for seed in SEEDS])

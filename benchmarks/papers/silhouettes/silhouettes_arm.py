@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import amount, figure, recording
 from benchmarks.scenes.silhouettes_scene import shape_from_silhouettes
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.body_surfaces import body_mesh
@@ -161,11 +161,8 @@ def overlap(body: Body, state: BodyState, rig: Rig, seen: list[SilhouetteFrame])
 
 def run() -> None:
     """Print how well the arm is followed."""
-    folder = data("stereo_arm_handpose3d")
+    folder = recording("stereo_arm_handpose3d")
     name = f"arm and hand: frames of {LAST - FIRST} with an overlap of 0.7 or more in both views"
-    if folder is None:
-        figure(name, None, "frames", ">= 300", "no recording stereo_arm_handpose3d")
-        return
     with tempfile.TemporaryDirectory() as work:
         (Path(work) / "arm.toml").write_text(BODY)
         body = load_body(str(Path(work) / "arm.toml"))

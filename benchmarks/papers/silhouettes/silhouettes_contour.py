@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import amount, figure, recording
 from kinefit.bodies.surfaces.fourier import FourierCurve
 from kinefit.errors import ObservationError
 from kinefit.geometry import se3
@@ -103,10 +103,7 @@ def off_by(degrees: float, T: NDArray, random: np.random.Generator) -> NDArray:
 def run() -> None:
     """Print the figures."""
     _rendered()
-    folder = data("stereo_opencv_chessboard")
-    if folder is None:
-        figure("contour_real_px", None, "px", "<= 1", "the recording is absent")
-        return
+    folder = recording("stereo_opencv_chessboard")
     _real(folder)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy.images.silhouettes_anny import STEPS, follow, overlaps
 from benchmarks.accuracy.images.silhouettes_track import CAMERAS, FRAMES, take_text
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import NotMeasured, amount, data, figure
 from benchmarks.papers.silhouettes.silhouettes_shoulders import HELD, Shoulders, gain, shoulders, tracked
 from benchmarks.scenes.silhouettes_scene import shape_from_silhouettes
 from kinefit.assets import anny_files
@@ -95,9 +95,7 @@ def run() -> None:
     except AssetError as error:
         model, reason = None, error.problem
     if folder is None or model is None:
-        for name, (unit, goal) in NAMES.items():
-            figure(name, None, unit, goal, reason)
-        return
+        raise NotMeasured(reason)
     found = []
     for camera in HELD:
         found.append(held_out(folder, model, camera))

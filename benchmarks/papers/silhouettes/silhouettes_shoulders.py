@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.accuracy.images.silhouettes_track import CAMERAS, take_text
-from benchmarks.figures import amount, data, figure, quick
+from benchmarks.figures import amount, figure, quick, recording
 from kinefit.bodies import BodyState
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.geometry.camera import Rig
@@ -99,12 +99,8 @@ def gain(with_morphs: NDArray, without: NDArray) -> tuple[float, float]:
 
 def run() -> None:
     """Print the figures."""
-    folder = data("video_balancing_4cam")
+    folder = recording("video_balancing_4cam")
     names = "morphing_real_overlap_gain", "morphing_real_outline_gain", "morphing_real_raised_gain"
-    if folder is None:
-        for name in names:
-            figure(name, None, "", "> 0", "no recording video_balancing_4cam")
-        return
     with tempfile.TemporaryDirectory() as work:
         path = Path(work) / "take.toml"
         path.write_text(take_text(folder, "masks"))

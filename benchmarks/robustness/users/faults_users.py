@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from benchmarks.figures import amount, data, figure, module_of
+from benchmarks.figures import amount, figure, module_of, recording
 
 MODULES = ("markers", "calibration", "skeletons", "pictures", "sides")
 """Modules `faults_users_*` with CASES and SIBLINGS: {name: whether the answer to what lies in a folder is right}."""
@@ -33,10 +33,7 @@ def run() -> None:
         folders = {name: Path(folder) / str(number) for number, name in enumerate(siblings)}
         right = _right(siblings, folders)
     figure("faults_users_siblings", 100 * right / len(siblings), f"% of {len(siblings)}", "== 100")
-    root = data("cases_of_users")
-    if root is None:
-        figure("faults_users_cases", None, "%", "== 100", "cases_of_users is absent")
-        return
+    root = recording("cases_of_users")
     cases = {name: answer for module in modules for name, answer in module.CASES.items()}
     folders = {path.name: path for path in sorted(root.iterdir()) if path.is_dir() and path.name.startswith(KINDS)}
     missing = sorted(folders.keys() - cases.keys())
