@@ -21,7 +21,6 @@ AREAS: dict[str, dict[str, str]] = {
     },
     "depth": {
         "depth_surfaces": "closest points on tapered elliptical cylinders",
-        "depth_grids": "closest points on meshes",
         "depth_rendering": "drawing a body, and what depth sensors would have seen",
         "depth_images": "depth image -> points",
         "depth_stereo": "stereo pair -> points; faces and hands by their colour",

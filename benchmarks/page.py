@@ -139,8 +139,9 @@ def _glance(records: Mapping[str, Record], lines: Iterable[Mapping[str, str]]) -
         if absent := [name for name in named if name not in records or not records[name].value]:
             raise ValueError(f"docs/figures.toml, glance: not measured: {', '.join(absent)}")
         says = re.sub(r"\{([^{}]+)\}", lambda found: number(_short(records[found[1]].value)), line["says"])
-        missed = [_goal(records[name].goal).translate(_NO_BREAK) for name in named if records[name].verdict == "missed"]
-        verdict = f"**missed**: {', '.join(missed)}" if missed else "met"
+        missed = [records[name] for name in named if records[name].verdict == "missed"]
+        faults = ", ".join(f"{_short(one.value)} ({_goal(one.goal)})".translate(_NO_BREAK) for one in missed)
+        verdict = f"**missed**: {faults}" if missed else "met"
         table.append(("" if line["what"] == last else f"**{line['what']}**", says, verdict))
         last = line["what"]
     return table

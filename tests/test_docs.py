@@ -96,3 +96,10 @@ def test_every_part_of_benchmarks_is_one_module():
     modules = [path.stem for path in (ROOT / "benchmarks").rglob("*.py") if path.stem != "__init__"]
     parts = [part for area, named in AREAS.items() for part in (named or [area])]
     assert len(parts) > 100 and [part for part in parts if modules.count(part) != 1] == []
+
+
+def test_folders_of_benchmarks_are_small():
+    folders = {path.parent for path in (ROOT / "benchmarks").rglob("*.py")}
+    entries = {folder: [one for one in folder.iterdir() if one.name != "__pycache__"] for folder in folders}
+    assert len(folders) > 20
+    assert [f"{folder}: {len(names)}" for folder, names in entries.items() if len(names) > 15] == []

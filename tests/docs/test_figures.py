@@ -106,7 +106,7 @@ def test_every_figure_has_a_line_of_its_own_in_the_table_of_its_subject(records)
 
 def test_the_page_begins_with_sentences_of_the_log_and_ends_with_what_is_retired(records):
     text = page(records, WORDS)
-    assert "| **Solver** | 4.5 ms and 2.7° | **missed**: ≤\N{NO-BREAK SPACE}2 |" in text
+    assert "| **Solver** | 4.5 ms and 2.7° | **missed**: 2.7\N{NO-BREAK SPACE}(≤\N{NO-BREAK SPACE}2) |" in text
     assert text.endswith("| `gone` | its goal is met by another |\n")
 
 
