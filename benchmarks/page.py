@@ -71,7 +71,9 @@ def figures_of_subjects(records: Mapping[str, Record], subjects: Sequence[Mappin
 
 def rows_of(names: Iterable[str]) -> list[list[str]]:
     """Names in order, those that begin alike together, at most `_TOGETHER` in a row."""
-    return [row for _, group in groupby(sorted(names), _beginning(1)) for row in _parted([*group], 2)]
+    numbers = {name: [int(one) if one.isdigit() else one for one in re.split(r"(\d+)", name)] for name in names}
+    by_number = sorted(numbers, key=numbers.__getitem__)
+    return [row for _, group in groupby(by_number, _beginning(1)) for row in _parted([*group], 2)]
 
 
 def _beginning(words: int) -> Callable[[str], tuple[str, ...]]:

@@ -224,3 +224,11 @@ def _time(
         solution, iterations = solve(setting)
         cpu, wall = min(cpu, time.process_time() - cpu_before), min(wall, time.perf_counter() - wall_before)
     return cpu, wall, iterations, residuals(solution)
+
+
+def read_mot(path: Path) -> tuple[list[str], np.ndarray]:
+    """Names of the columns and the table of a MOT or STO file."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    head = lines.index("endheader")
+    rows = [[float(v) for v in line.split()] for line in lines[head + 2 :] if line.strip()]
+    return lines[head + 1].split(), np.array(rows)

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 import opensim
 
-from benchmarks.peers.opensim_takes import own_tool, read_mot
+from benchmarks.peers import read_mot
+from benchmarks.peers.opensim_takes import own_tool
 
 
 def own_angles(folder: Path) -> float:

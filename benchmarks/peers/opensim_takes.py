@@ -17,15 +17,9 @@ from pathlib import Path
 import numpy as np
 import opensim
 
+from benchmarks.peers import read_mot
+
 REPEATS = 2
-
-
-def read_mot(path: Path) -> tuple[list[str], np.ndarray]:
-    """Names of the columns and the table of a MOT or STO file."""
-    lines = path.read_text(encoding="utf-8").splitlines()
-    head = lines.index("endheader")
-    rows = [[float(v) for v in line.split()] for line in lines[head + 2 :] if line.strip()]
-    return lines[head + 1].split(), np.array(rows)
 
 
 def centres(model: opensim.Model, mot: Path, joints: dict[str, str]) -> np.ndarray:

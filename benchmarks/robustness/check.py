@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.video.tracking import DETECTORS, NOISE, TRIAL, take_text
+from benchmarks.accuracy.video.tracking import DETECTORS, NOISE, take_text
 from benchmarks.figures import each, figure, recording
+from benchmarks.scenes.balancing import TRIAL
 from benchmarks.scenes.motions import library
 from kinefit import Keypoints, Motion, Rig
 from kinefit.diagnostics.checks import Checked, check_keypoints

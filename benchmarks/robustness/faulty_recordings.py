@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.video.tracking import DETECTORS, TRIAL, take_text
+from benchmarks.accuracy.video.tracking import DETECTORS, take_text
 from benchmarks.figures import amount, data
+from benchmarks.scenes.balancing import TRIAL
 from kinefit.assets import write_sample_take
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.camera import Rig

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import av
 
-from benchmarks.figures import LEFT_OUT, data, figure, quick
+from benchmarks.figures import figure, whole_recording
 from kinefit.readers.video import Video
 
 _SECONDS, _RATE = 10.0, 60
@@ -24,16 +24,11 @@ _SECONDS, _RATE = 10.0, 60
 
 def run() -> None:
     """Print every figure of time and memory."""
-    recording = data("video_balancing_4cam")
-    if recording is None or quick():
-        why = LEFT_OUT if quick() else "no recording video_balancing_4cam"
-        figure("phones_speed", None, "x the length of all videos", "<= 6", why)
-        figure("phones_memory", None, "GB", "<= 2", why)
-        return
+    trial = whole_recording("video_balancing_4cam")
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work) / "take"
         folder.mkdir()
-        for path in sorted((recording / "videos").glob("*.mp4")):
+        for path in sorted((trial / "videos").glob("*.mp4")):
             _played(path, folder / path.name)
         spent = {}
         for step in (["init", "."], ["detect", "take.toml"], ["track", "take.toml"]):

@@ -23,17 +23,15 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy.images.silhouettes_track import take_text
 from benchmarks.figures import amount, figure, recording
+from benchmarks.scenes.balancing import seen_of, tracked
 from benchmarks.scenes.silhouettes_scene import of_meshes, ring, swaying
 from kinefit.bodies import Body, load_body
 from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.geometry.camera import Rig
 from kinefit.images.silhouette import colour_mask
 from kinefit.observations import SilhouetteFrame
-from kinefit.readers.take.file import read_take
-from kinefit.readers.take.load import load_observations
 from kinefit.rendering import Canvas, lens_of, render_body
 from kinefit.sensors.settings import TrackSettings
-from kinefit.takes.track import track_take
 from kinefit.tracking.tracker import Tracker
 
 FRAMES, WARM, ROUNDS = amount(45, 15), 5, amount(6, 1)
@@ -110,12 +108,8 @@ def _real(rendered_ms: float) -> None:
     folder = recording("video_balancing_4cam")
     names = "silhouettes_real_4_cameras_ms", "silhouettes_real_to_rendered"
     text = take_text(folder, "masks").replace("height = 1.75", "size = false")
-    with tempfile.TemporaryDirectory() as work:
-        path = Path(work) / "take.toml"
-        path.write_text(re.sub(r"frames = \[0, \d+\]", f"frames = [0, {FRAMES}]", text, count=1))
-        seen = load_observations(read_take(path))
-        path.write_text(re.sub(r"frames = \[0, \d+\]", "frames = [0, 2]", text, count=1))
-        start = track_take(path, smooth=False)[0]
+    seen = seen_of(re.sub(r"frames = \[0, \d+\]", f"frames = [0, {FRAMES}]", text, count=1))
+    start = tracked(re.sub(r"frames = \[0, \d+\]", "frames = [0, 2]", text, count=1), smooth=False)[0]
     assert seen.rig is not None
     masks = [[video.frame(i) for video in seen.of_kind("silhouette")] for i in range(FRAMES)]
     rounds: list[list[float]] = []

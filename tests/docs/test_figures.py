@@ -122,7 +122,11 @@ def test_figures_that_begin_alike_share_a_row_of_the_table(records):
 def test_no_figure_is_lost_among_many(count):
     names = sorted(f"{first}_{k % 3}_{k}" for first in ("a", "b", "a b") for k in range(count))
     rows = rows_of(reversed(names))
-    assert [name for row in rows for name in row] == names and max(map(len, rows)) <= 9
+    assert sorted(name for row in rows for name in row) == names and max(map(len, rows)) <= 9
+
+
+def test_numbers_in_names_are_sorted_as_numbers():
+    assert rows_of(f"row_{k}" for k in range(11))[0][:3] == ["row_0", "row_1", "row_2"]
 
 
 def test_a_figure_that_was_not_measured_has_no_value(records):

@@ -272,4 +272,3 @@ def _motion(body: Body, states: list[BodyState], rate: float) -> Motion:
         np.zeros((count, len(body.tree.segments), 3)), np.ones(count), np.ones((count, len(body.tree.segments))),
         up="y",
     )  # fmt: skip
-

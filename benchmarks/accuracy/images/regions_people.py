@@ -6,7 +6,6 @@ were chosen on this very trial, the only real one of a whole person: it is not h
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,10 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.images.silhouettes_track import CAMERAS, overlaps, tracked, trial_text
+from benchmarks.accuracy.images.silhouettes_track import overlaps
 from benchmarks.accuracy.images.silhouettes_track import take_text as masks_text
 from benchmarks.accuracy.mixed import mixed_real
 from benchmarks.figures import LEFT_OUT, NotMeasured, amount, figure, quick, recording
+from benchmarks.scenes.balancing import CAMERAS, seen_of, tracked, trial_text
 from kinefit.bodies import BodyState
 from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.correspondences.contours.rims import RimFinder
@@ -25,8 +25,6 @@ from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES, Motion
 from kinefit.multiview.association import choose_people
 from kinefit.observations import SilhouetteVideo
-from kinefit.readers.take.file import read_take
-from kinefit.readers.take.load import Observations, load_observations
 from kinefit.recipes.regions import pose_from_regions
 from kinefit.rendering import render_body, scaled
 from kinefit.smoothing.foot_contacts import find_contacts
@@ -47,15 +45,8 @@ GOALS = {
 def take_text(folder: Path, cameras: Sequence[str] = CAMERAS, *, regions: bool = True, first: bool = True) -> str:
     """The trial with the colours of some cameras, and with keypoints of its first frame, or of all."""
     beside = {camera: f'[[region]]\ncamera = "{camera}"\n' if regions else "" for camera in cameras}
-    return trial_text(folder, beside, "frames = [0, 1]\n" if first else "")
-
-
-def seen_of(text: str) -> Observations:
-    """What the sensors of a take saw."""
-    with tempfile.TemporaryDirectory() as work:
-        path = Path(work) / "take.toml"
-        path.write_text(text)
-        return load_observations(read_take(path))
+    head = f"height = 1.75\nframes = [0, {FRAMES}]\n"
+    return trial_text(folder, beside, head=head, keypoints="frames = [0, 1]\n" if first else "")
 
 
 def run() -> None:
@@ -65,7 +56,7 @@ def run() -> None:
     masks = seen_of(masks_text(folder, "masks"))
     rig = masks.rig
     assert rig is not None
-    motion = tracked(take_text(folder, TRACKED))
+    motion = tracked(take_text(folder, TRACKED))[0]
     alone = overlaps(motion, rig, masks.silhouettes)
     figure(names[0], alone.mean(), "", GOALS[names[0]])
     print(f"  camera by camera {np.round(alone.mean(axis=0), 3)}, worst image {alone.min():.3f}; "
@@ -76,7 +67,7 @@ def run() -> None:
         raise NotMeasured(LEFT_OUT)
     held = []
     for k, camera in enumerate(CAMERAS):
-        of = tracked(take_text(folder, [c for c in CAMERAS if c != camera]))
+        of = tracked(take_text(folder, [c for c in CAMERAS if c != camera]))[0]
         held.append(overlaps(of, rig, masks.silhouettes[k : k + 1]).mean())
         print(f"  {camera} held out: {held[-1]:.3f}", flush=True)
     figure(names[2], float(np.mean(held)), "", GOALS[names[2]])
@@ -86,7 +77,7 @@ def run() -> None:
 
 def _with_contacts(folder: Path, motion: Motion, rig: Rig, masks: Sequence[SilhouetteVideo]) -> None:
     """What changes where soles are held while they rest, on the beam or on the ground."""
-    held = tracked(take_text(folder, TRACKED), contacts=True)
+    held = tracked(take_text(folder, TRACKED), contacts=True)[0]
     found = find_contacts(held.body, held.Ts_world_root, held.angles, held.rate, held.up)
     resting = found.weight > 0
     if not resting.any():
@@ -110,7 +101,7 @@ def _beside_keypoints(folder: Path, rig: Rig, masks: Sequence[SilhouetteVideo]) 
     people = choose_people(rig, seen.keypoints)
     off, share = [], []
     for regions in (False, True):
-        motion = tracked(take_text(folder, regions=regions, first=False))
+        motion = tracked(take_text(folder, regions=regions, first=False))[0]
         off.append(float(np.nanmedian(mixed_real.residuals(motion, rig, seen.keypoints, people))))
         share.append(float(overlaps(motion, rig, masks).mean()))
     names = list(GOALS)

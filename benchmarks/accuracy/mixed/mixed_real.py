@@ -8,47 +8,28 @@ on; left or right, whichever is nearer, as MediaPipe swaps them in cam02; the me
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.images.silhouettes_track import CAMERAS, overlaps
+from benchmarks.accuracy.images.silhouettes_track import overlaps
 from benchmarks.figures import NotMeasured, data, figure
-from kinefit import Keypoints, Motion, Rig, track_take
+from benchmarks.scenes.balancing import CAMERAS, TRIAL, masks_of, tracked, trial_text
+from kinefit import Keypoints, Motion, Rig
 from kinefit.errors import KinefitError
 from kinefit.multiview.association import choose_people
-from kinefit.readers.take.load import Observations
 from kinefit.sensors.channels import mirror_name
 
-TRIAL, QUICK, SWAPS = "video_balancing_4cam", 6, 32
-SETS = {"openpose": "BODY_25B", "mediapipe": "MEDIAPIPE_33"}
+QUICK, SWAPS = 6, 32
+DETECTORS = ("openpose", "mediapipe")
 
 
 def take_text(folder: Path, detector: str, silhouettes: bool, cameras: Sequence[str] = CAMERAS, frames: int = 0) -> str:
     """The trial by keypoints of some cameras, with or without their masks; its first frames only, where so many."""
-    text = '[take]\nname = "balancing"\nup = "z"\n' + (f"frames = [0, {frames}]\n" if frames else "")
-    text += f'[calibration]\nfile = "{folder}/Calib_refined_static.toml"\nunit = "m"\n'
-    for camera in cameras:
-        text += f'[[camera]]\nname = "{camera}"\nvideo = "{folder}/videos/{camera}.mp4"\n'
-        text += 'image = "letterboxed"\n' if camera in ("cam01", "cam02") else ""
-        file = f"openpose_json/{camera}" if detector == "openpose" else f"mediapipe_landmarks_{camera}.npy"
-        frame = "calibration" if detector == "openpose" else "video"
-        text += f'[[keypoints]]\ncamera = "{camera}"\nfile = "{folder}/{file}"\nformat = "{detector}"\n'
-        text += f'set = "{SETS[detector]}"\nframe = "{frame}"\n'
-        if silhouettes:
-            text += f'[[silhouette]]\ncamera = "{camera}"\nfile = "{folder}/person_masks/{camera}"\nframe = "video"\n'
-    return text
-
-
-def tracked(text: str) -> tuple[Motion, Observations]:
-    """Motion of a take, and what its sensors saw."""
-    with tempfile.TemporaryDirectory() as work:
-        path = Path(work) / "take.toml"
-        path.write_text(text, encoding="utf-8")
-        return track_take(path)
+    beside = {camera: masks_of(folder, camera) if silhouettes else "" for camera in cameras}
+    return trial_text(folder, beside, detector=detector, head=f"frames = [0, {frames}]\n" if frames else "")
 
 
 def residuals(motion: Motion, rig: Rig, keypoints: Sequence[Keypoints], people: Sequence[NDArray]) -> NDArray:
@@ -85,7 +66,7 @@ def run(quick: bool = False) -> None:
         raise NotMeasured("the real trial is absent")
     values: dict[str, float] = {}
     reasons: dict[str, str] = {}
-    for detector in SETS:
+    for detector in DETECTORS:
         try:
             values |= both(folder, detector, frames, quick)
         except KinefitError as error:

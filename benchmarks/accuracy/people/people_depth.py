@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import amount, each, figure, recording
 from kinefit import Motion, track_take
 from kinefit.motion import BELIEVED
 from kinefit.readers.take.load import Observations
@@ -85,15 +85,12 @@ range = {range}
 
 def run() -> None:
     """Print every figure."""
-    _kinect()
-    _sr305()
+    each(_kinect, _sr305)
 
 
 def _kinect() -> None:
-    folder = data("depth_skeltrack_kinect1")
+    folder = recording("depth_skeltrack_kinect1")
     names = list(KINECT)[amount(slice(None), slice(1, 2))]  # in the first image are two people
-    if folder is None:
-        return _none("people_kinect")
     with tempfile.TemporaryDirectory() as work:
         for name in names:
             (Path(work) / f"depth-data-{name}").symlink_to(folder / f"depth-data-{name}")
@@ -108,13 +105,10 @@ def _kinect() -> None:
     heads = [gap for (_, of), (gap, _) in gaps.items() if of == "head"]
     print(f"# heads, the middle between the ears: median {100 * float(np.median(heads)):.0f} cm off")
     _tell(gaps, names, 0.06)
-    return None
 
 
 def _sr305() -> None:
-    folder = data("depth_sr305_upperbody")
-    if folder is None:
-        return _none("people_sr305")
+    folder = recording("depth_sr305_upperbody")
     every, spent = [], []
     for take, images in list(SR305.items())[: amount(None, 1)]:
         count = amount(len(images), 1)
@@ -129,7 +123,6 @@ def _sr305() -> None:
         _tell(gaps, list(images), 0.04)
         every += list(gaps.values())
     _figures("people_sr305", every, 0.04, max(spent))
-    return None
 
 
 def _figures(area: str, gaps: list[tuple[float, bool]], limit: float, spent: float) -> None:
@@ -139,12 +132,6 @@ def _figures(area: str, gaps: list[tuple[float, bool]], limit: float, spent: flo
     for name, value in {**{name: float(np.sum(of)) for name, of in counts.items()}, "seconds": spent}.items():
         figure(f"{area}_{name}", value, *_GOALS[f"{area}_{name}"])
     print(f"# {area}: {100 * float(np.mean(right | lost)):.0f} % right or said to be lost")
-
-
-def _none(area: str) -> None:
-    for name, (unit, goal) in _GOALS.items():
-        if name.startswith(area):
-            figure(name, None, unit, goal, "no recording")
 
 
 def _tracked(text: str, work: Path) -> tuple[Motion, Observations]:

@@ -15,7 +15,7 @@ import numpy as np
 from tests.exporters.skeletons.character_file import write_character_glb
 from tests.exporters.skeletons.test_characters import BONES, SIDES, WORDS, play, unit
 
-from benchmarks.figures import amount, data, figure
+from benchmarks.figures import NotMeasured, amount, data, figure
 from kinefit.exporters import write_character
 from kinefit.motion import Motion
 from kinefit.readers.skeletons.bvh import read_bvh
@@ -48,8 +48,7 @@ def run() -> None:
                 bones.append(off)
                 heights.append(height)
         if not files:
-            figure("retarget_validator_errors", None, "errors", "== 0", "no recordings")
-            return
+            raise NotMeasured("no recordings")
         errors, why = validated(files)
     figure("retarget_validator_errors", errors, "errors", "== 0", why)
     figure("retarget_bones", max(bones), "deg, worst of arms and legs", "<= 0.01")

@@ -18,7 +18,6 @@ from benchmarks.accuracy.video.static_points import HIGH, static_residual
 from benchmarks.accuracy.video.tracking import (
     DETECTORS,
     NOISE,
-    TRIAL,
     Trial,
     held_out,
     median_residual,
@@ -26,6 +25,7 @@ from benchmarks.accuracy.video.tracking import (
     read_trial,
 )
 from benchmarks.figures import amount, each, figure, whole_recording
+from benchmarks.scenes.balancing import TRIAL
 from benchmarks.scenes.motions import library
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, track
 from kinefit.calibration.people.calibrate import calibrate_people

@@ -19,8 +19,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.video.tracking import NOISE, TRIAL, median_residual, read_trial
+from benchmarks.accuracy.video.tracking import NOISE, median_residual, read_trial
 from benchmarks.figures import amount, each, figure, recording
+from benchmarks.scenes.balancing import TRIAL
 from benchmarks.scenes.motions import library
 from kinefit import Motion, Recording, load_body, read_markers, track
 from kinefit.bodies import PointSet

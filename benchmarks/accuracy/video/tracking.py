@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import LEFT_OUT, NotMeasured, amount, each, figure, quick, recording
+from benchmarks.scenes.balancing import TRIAL, trial_text
 from benchmarks.scenes.held_out import sides_right
 from benchmarks.scenes.motions import library
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, load_observations, read_take, track
@@ -24,7 +25,6 @@ from kinefit.evaluation import angle_errors, coverage, joint_errors
 from kinefit.geometry.lines import triangulate_robust
 from kinefit.simulation import simulate_keypoints, studio_rig
 
-TRIAL = "video_balancing_4cam"
 DETECTORS = ("openpose", "mediapipe")
 FRAMES = amount("== 100", "== 12")
 GOALS = {"openpose": 9.0, "mediapipe": 11.0}
@@ -33,18 +33,7 @@ NOISE = {"noise_px": 3.0, "outliers": 0.1, "missing": 0.1}
 
 def take_text(folder: Path, detector: str) -> str:
     """Take file of the real trial with one detector's keypoints."""
-    lines = ['[take]\nname = "balancing"\nup = "z"\n' + amount("", "frames = [0, 12]\n")]
-    lines.append(f'[calibration]\nfile = "{folder}/Calib_refined_static.toml"\nunit = "m"\n')
-    for c in range(1, 5):
-        camera = f"cam0{c}"
-        boxed = 'image = "letterboxed"\n' if c <= 2 else ""
-        lines.append(f'[[camera]]\nname = "{camera}"\nvideo = "{folder}/videos/{camera}.mp4"\n{boxed}')
-        file = f"openpose_json/{camera}" if detector == "openpose" else f"mediapipe_landmarks_{camera}.npy"
-        frame = "calibration" if detector == "openpose" else "video"
-        lines.append(
-            f'[[keypoints]]\ncamera = "{camera}"\nfile = "{folder}/{file}"\nformat = "{detector}"\nframe = "{frame}"\n'
-        )
-    return "\n".join(lines)
+    return trial_text(folder, detector=detector, head='name = "balancing"\n' + amount("", "frames = [0, 12]\n"))
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.accuracy.images.regions_cat import images, truth
-from benchmarks.accuracy.images.silhouettes_track import FRAMES, take_text, tracked
+from benchmarks.accuracy.images.silhouettes_track import FRAMES, take_text
 from benchmarks.figures import amount, data, figure
 from benchmarks.papers.silhouettes.silhouettes_cat import take_by_silhouettes
 from benchmarks.papers.silhouettes.silhouettes_contour import off_by
+from benchmarks.scenes.balancing import tracked
 from benchmarks.scenes.regions_scene import away
 from kinefit.bodies.serial import save_body
 from kinefit.motion import Motion
@@ -63,7 +64,7 @@ def _toy(folder: Path) -> NDArray:
 
 def _person(folder: Path) -> NDArray:
     """(kinds, angles, steps) bool."""
-    motion = tracked(take_text(folder, "masks"))
+    motion = tracked(take_text(folder, "masks"))[0]
     out = np.zeros((len(KINDS), len(PERSON_OFF), len(PERSON_STEPS)), bool)
     for a, off in enumerate(PERSON_OFF):
         for k, i in enumerate(PERSON_STEPS):

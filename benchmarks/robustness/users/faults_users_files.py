@@ -257,8 +257,6 @@ def _tum(folder: Path) -> str:
     return state(right and "0.0002" in told and "[[depth]]" in (folder / "take.toml").read_text(), told, "0.0002")
 
 
-
-
 def _stepped(folder: Path, pattern: str, step: int, start: int = 0) -> Path:
     (folder / "depth").mkdir()
     for i, image in enumerate(np.rint(1e3 * scene(5)).astype(np.uint16)):
