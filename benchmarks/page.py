@@ -22,7 +22,7 @@ OLD = timedelta(weeks=4)
 _TOGETHER = 9
 """Figures that share a row at most."""
 
-_LONG_UNIT = 32
+_LONG_UNIT = 22
 """Letters of a unit from which on only its first words are shown."""
 
 _SIGNS = {"<=": "≤ ", ">=": "≥ ", ">": "> ", "==": ""}
@@ -96,19 +96,20 @@ def _parted(names: list[str], words: int) -> list[list[str]]:
 
 def _cells(names: list[str], records: Mapping[str, Record], newest: date) -> tuple[str, ...]:
     *columns, runs = zip(*(_line(name, records.get(name), newest) for name in names), strict=True)
-    return *map("<br>".join, columns), runs[0] if len({*runs}) == 1 else "<br>".join(runs)
+    run = runs[0] if len({*runs}) == 1 else "<br>".join(one.translate(_NO_BREAK) for one in runs)
+    return *map("<br>".join, columns), run
 
 
 def _line(name: str, record: Record | None, newest: date) -> tuple[str, ...]:
-    """What stands in the columns of one figure, none of which is wrapped, so that they stay side by side."""
+    """What stands in the columns of one figure, none of which is wrapped but a run that stands once."""
     shown = f"`{name}`".replace(" ", " ".translate(_NO_BREAK))
     if record is None:
-        return shown, "–", "–", "–", "never logged".translate(_NO_BREAK)
+        return shown, "–", "–", "–", "never logged"
     verdict = f"**{record.verdict}**" if record.verdict == "missed" else record.verdict
     state = ", more than four weeks old" if newest - date.fromisoformat(record.date) > OLD else ""
     state += f", {BEFORE}" if record.reason == BEFORE else ""
-    cells = _value(record), _goal(record.goal), verdict, f"{record.date} {record.commit}{state}"
-    return shown, *(cell.translate(_NO_BREAK) for cell in cells)
+    cells = (cell.translate(_NO_BREAK) for cell in (_value(record), _goal(record.goal), verdict))
+    return shown, *cells, f"{record.date} {record.commit}{state}"
 
 
 def _value(record: Record) -> str:
