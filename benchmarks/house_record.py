@@ -15,10 +15,9 @@ from benchmarks.figures import figure
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORD = ROOT / "tests" / "capabilities.txt"
-_MOVED_ROOM = "a room of 0.2 that lies in another now; `kinefit._moved` finds it, with a warning"
 LOST = {
     "finding Finding markers": "what readers note on marker files is a finding `files`, as on all other files",
-    **{f"name {room}": _MOVED_ROOM for room in ("assets", "correspondences", "evaluation", "recipes", "rendering")},
+    "name recipes": "the room is called papers; `kinefit.recipes` still is it",
 }
 """{line of the record that is no longer: why}"""
 

@@ -9,8 +9,7 @@ import sys
 import numpy as np
 
 import kinefit
-from kinefit import simulation
-from kinefit.simulation import evaluation
+from kinefit import evaluation, simulation
 
 
 def main(bvh=None, frames=60, noise_px=3.0):

@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 
 import kinefit
-from kinefit.bodies import rendering
-from kinefit.solving import correspondences
+from kinefit import correspondences, rendering
 
 ARM = """
 [body]

@@ -3,8 +3,9 @@
 from importlib import import_module
 from importlib.util import find_spec
 
-import kinefit
 import pytest
+
+import kinefit
 from kinefit._moved import MOVED, moved
 
 
@@ -25,8 +26,8 @@ def test_a_module_is_one_under_both_names(old, new):
 
 
 def test_rooms_of_old_are_attributes():
-    with pytest.warns(DeprecationWarning, match="kinefit.papers now"):
-        assert kinefit.recipes is import_module("kinefit.papers")
+    assert kinefit.recipes is import_module("kinefit.papers")
+    assert kinefit.rendering is import_module("kinefit.bodies.rendering")
 
 
 def test_what_never_was_is_no_module():

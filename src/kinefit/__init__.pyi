@@ -89,6 +89,10 @@ from kinefit.simulation.retarget import retarget as retarget
 # Errors, and rooms that `kinefit.` reaches without an import of their own
 from kinefit import bodies as bodies, exporters as exporters, observations as observations, papers as papers
 from kinefit import simulation as simulation
+from kinefit.bodies import rendering as rendering
+from kinefit.readers import assets as assets
+from kinefit.simulation import evaluation as evaluation
+from kinefit.solving import correspondences as correspondences
 from kinefit.errors import KinefitError as KinefitError
 
 __version__: str
