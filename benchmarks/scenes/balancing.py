@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from kinefit.motion import Motion
+from kinefit.bodies.motion import Motion
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.takes.track import track_take

@@ -17,6 +17,10 @@ from importlib import import_module  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
 
+from kinefit._moved import MovedFinder, moved  # noqa: E402
+
+sys.meta_path.insert(0, MovedFinder())
+
 __version__ = "0.2.0"
 
 
@@ -35,7 +39,10 @@ def __getattr__(name: str) -> Any:
     if module == __name__:
         return import_module(f"{module}.{attribute}")
     if module:
-        return getattr(import_module(module), attribute)
+        found = getattr(import_module(module), attribute, None)
+        return found or import_module(f"{module}.{attribute}")
+    if new := moved(f"kinefit.{name}"):
+        return import_module(new)
     raise AttributeError(f"module 'kinefit' has no attribute '{name}'")
 
 

@@ -19,15 +19,15 @@ from benchmarks.accuracy.mixed import mixed_real
 from benchmarks.figures import LEFT_OUT, NotMeasured, amount, figure, quick, recording
 from benchmarks.scenes.balancing import CAMERAS, seen_of, tracked, trial_text
 from kinefit.bodies import BodyState
-from kinefit.bodies.body_surfaces import body_mesh
-from kinefit.correspondences.contours.rims import RimFinder
+from kinefit.bodies.motion import UP_AXES, Motion
+from kinefit.bodies.rendering import render_body, scaled
+from kinefit.bodies.surfaces.places import body_mesh
+from kinefit.fitting.multiview.association import choose_people
+from kinefit.fitting.smoothing.foot_contacts import find_contacts
 from kinefit.geometry.camera import Rig
-from kinefit.motion import UP_AXES, Motion
-from kinefit.multiview.association import choose_people
 from kinefit.observations import SilhouetteVideo
-from kinefit.recipes.regions import pose_from_regions
-from kinefit.rendering import render_body, scaled
-from kinefit.smoothing.foot_contacts import find_contacts
+from kinefit.papers.regions import pose_from_regions
+from kinefit.solving.correspondences.contours.rims import RimFinder
 
 FRAMES = amount(100, 3)
 TRACKED = amount(CAMERAS, CAMERAS[:2])

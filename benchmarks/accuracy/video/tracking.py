@@ -21,9 +21,9 @@ from benchmarks.scenes.balancing import TRIAL, trial_text
 from benchmarks.scenes.held_out import sides_right
 from benchmarks.scenes.motions import library
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, load_observations, read_take, track
-from kinefit.evaluation import angle_errors, coverage, joint_errors
 from kinefit.geometry.lines import triangulate_robust
 from kinefit.simulation import simulate_keypoints, studio_rig
+from kinefit.simulation.evaluation import angle_errors, coverage, joint_errors
 
 DETECTORS = ("openpose", "mediapipe")
 FRAMES = amount("== 100", "== 12")

@@ -22,11 +22,11 @@ from benchmarks.accuracy.closures.closures_takes import Take
 from benchmarks.figures import LEFT_OUT, ROOT, amount, figure, quick
 from benchmarks.papers.regions.gear_takes import GearTake, rendered_cyclist, rendered_snowboarder
 from benchmarks.scenes.curves import COLOURS, curves
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.motion import Motion
+from kinefit.bodies.rendering import Canvas, render_body
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.geometry.camera import Camera
 from kinefit.images.silhouette import BackgroundPlate
-from kinefit.motion import Motion
-from kinefit.rendering import Canvas, render_body
 from kinefit.takes.track import track_take
 
 SEEDS = (11, 12)

@@ -20,8 +20,8 @@ from benchmarks.papers.silhouettes.silhouettes_cat import take_by_silhouettes
 from benchmarks.papers.silhouettes.silhouettes_contour import off_by
 from benchmarks.scenes.balancing import tracked
 from benchmarks.scenes.regions_scene import away
+from kinefit.bodies.motion import Motion
 from kinefit.bodies.serial import save_body
-from kinefit.motion import Motion
 from kinefit.takes.track import track_take
 
 TOY_OFF, PERSON_OFF = amount((20.0, 35.0, 50.0), (35.0,)), amount((20.0, 30.0), (20.0,))  # [deg]

@@ -21,16 +21,16 @@ from benchmarks.figures import NotMeasured, amount, data, figure
 from benchmarks.papers.silhouettes.silhouettes_shoulders import HELD, Shoulders, gain, shoulders, tracked
 from benchmarks.scenes.balancing import CAMERAS, seen_of
 from benchmarks.scenes.silhouettes_scene import shape_from_silhouettes
-from kinefit.assets import anny_files
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.anny import AnnyModel, load_anny
+from kinefit.bodies.morphs.anny import AnnyModel, load_anny
+from kinefit.bodies.motion import Motion
 from kinefit.errors import AssetError
+from kinefit.fitting.subject.parameters import SegmentScales
+from kinefit.fitting.subject.surfaces import AnnyShape
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Motion
 from kinefit.observations import SilhouetteVideo
+from kinefit.readers.assets import anny_files
 from kinefit.simulation.retarget import known_motion
-from kinefit.subject.parameters import SegmentScales
-from kinefit.subject.surfaces import AnnyShape
 
 FIRST, THEN = amount(6, 2), amount(20, 3)  # frames that the shape is found from
 NAMES = {
