@@ -1,8 +1,8 @@
-"""Every row of docs/papers, tried once: `python -m benchmarks.papers`; its values: `python -m benchmarks.papers fill`.
+"""Rows of docs/papers, each tried once: `python -m benchmarks.papers`; their values: `python -m benchmarks.papers --fill`.
 
 A page a paper has a heading a row. The parts of benchmarks that a row names run in their quick form; a row that names
 none is tried by its tests. The quick form of this area runs neither, as the other areas and the tests do: it checks
-that all that the pages name is there. `fill` writes the values of the pages' tables, and the index docs/papers.md, as
+that all that the pages name is there. `--fill` writes the values of the pages' tables, and the index docs/papers.md, as
 the log has them.
 """
 
@@ -93,8 +93,12 @@ def _row(item: str, title: str, text: str) -> Row:
 
 
 def filled_page(text: str, records: Mapping[str, Record]) -> str:
-    """A page whose tables have value, goal, verdict and date as the log has them."""
-    return _FIGURE.sub(lambda found: f"| `{found[1]}` | {' | '.join(_cells(records[found[1]]))} |", text)
+    """A page whose rows have tables with value, goal, verdict and date as the log has them."""
+
+    def line(found: re.Match[str]) -> str:
+        return f"| `{found[1]}` | {' | '.join(_cells(records[found[1]]))} |"
+
+    return _ROW.sub(lambda row: _FIGURE.sub(line, row[0]), text)
 
 
 def filled_index(text: str, rows: Iterable[Row], records: Mapping[str, Record]) -> str:
@@ -164,7 +168,7 @@ def run() -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["fill"]:
+    if sys.argv[1:] == ["--fill"]:
         fill()
     else:
         run_parts(PARTS)

@@ -261,12 +261,12 @@ def voodoo(folder):
 PREPARED = {
     "anny": anny, "batch": batch, "calibration": calibration, "check": check, "depth-start": depth_start,
     "files": files, "live": live, "marker-fitting": marker_fitting, "markers": markers, "morphing": morphing,
-    "motion": motion, "own-sensor": own_sensor, "recipes/depth-fusion": depth_fusion,
-    "recipes/metaballs": printed_metaballs, "recipes/regions": printed_regions, "regions": regions,
-    "report": report, "rows": rows, "recipes/sapm": sapm, "recipes/silhouettes": silhouettes, "simulate": simulate,
+    "motion": motion, "own-sensor": own_sensor, "depth": depth_fusion,
+    "printed-metaballs": printed_metaballs, "printed-regions": printed_regions, "regions": regions,
+    "report": report, "rows": rows, "printed-sapm": sapm, "silhouettes": silhouettes, "simulate": simulate,
     "smoothing": smoothing, "solvers": solvers, "stereo": stereo, "surfaces": surfaces, "take-file": take_file,
     "view": view,
-    "recipes/voodoo": voodoo,
+    "printed-voodoo": voodoo,
 }  # fmt: skip
 """{page: its function}."""
 
@@ -276,5 +276,5 @@ AFTER = {"live": ("follow('take.toml')",)}
 NETWORK = {"anny"}
 """Pages whose blocks fetch a pinned package."""
 
-SLOW = {"anny", "batch", "calibration", "recipes/depth-fusion", "recipes/silhouettes"}
+SLOW = {"anny", "batch", "calibration", "depth", "silhouettes"}
 """Pages that take more than a few seconds."""

@@ -24,7 +24,7 @@ def test_every_row_has_its_heading_and_all_parts():
 
 def test_pages_and_index_show_what_the_log_says():
     records = read(LOG)
-    hint = "values are printed, not written: python -m benchmarks.papers fill"
+    hint = "values are printed, not written: python -m benchmarks.papers --fill"
     assert [filled_page(text, records) for text in TEXTS] == TEXTS, hint
     index = INDEX.read_text("utf-8")
     assert filled_index(index, read_rows(TEXTS), records) == index, hint
@@ -46,7 +46,7 @@ def test_a_line_that_is_lost_comes_back_in_its_place():
 
 def test_an_unknown_figure_is_an_error():
     with pytest.raises(KeyError, match="nothing_has_this_name"):
-        filled_page("| `nothing_has_this_name` | 1 | <= 2 | met | 2026-01-01 |", read(LOG))
+        filled_page("## P9-1 A row\n\n| `nothing_has_this_name` | 1 | <= 2 | met | 2026-01-01 |", read(LOG))
 
 
 def test_a_row_names_its_way_its_misses_and_its_figures():

@@ -1,11 +1,9 @@
 """The Anny body in takes: its shape is found from silhouettes, with the poses, by the command."""
 
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from tests.docs.blocks import blocks
 from tests.sensors.scenes import posture, ring
 from tests.tracking.test_starts import saved
 
@@ -24,7 +22,6 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.surfaces import AnnyShape, CylinderShape, shape_of
 
 FRAMES = 6
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "anny.md"
 
 
 @pytest.fixture(scope="module")
@@ -65,17 +62,16 @@ def test_without_its_files_it_is_told_how_to_fetch_them(tmp_path, monkeypatch):
 def test_the_examples_of_the_page(model, tmp_path, monkeypatch):
     """Run as they stand, with two silhouettes of the usual body."""
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.S)
-    assert len(blocks) == 2
+    first, second = (block.text for block in blocks("anny", "python"))
     given = {"rig": ring(2)}
-    exec(blocks[0], given)
+    exec(first, given)
     body, rig = given["body"], given["rig"]
     assert load_body("person.npz").skin is not None
     state, sensors = posture(body, 0), [SilhouetteSensor(c, 1.0, TrackSettings()) for c in rig]
     scene = Scene(body, state, rig)
     frames = [SilhouetteFrame(c.name, 0.0, render_body(body, state, c).seen) for c in rig]
     given |= {"steps": [[s.prepare(f, scene) for s, f in zip(sensors, frames)]], "states": [state]}
-    exec(blocks[1], given)
+    exec(second, given)
     assert given["found"].value("anny gender")[1] > 0.0
 
 
