@@ -32,11 +32,11 @@ from kinefit.tracking.checkpoints.checkpoint import Checkpoint, TrackingInterrup
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.sizing import channels_of
 from kinefit.tracking.take_recording import (
-    from_afar,
     label_findings_of,
     on_floor,
     recording_of,
     rig_on_floor,
+    with_fitted_start,
 )
 from kinefit.tracking.video import Progress, track
 
@@ -92,7 +92,7 @@ def track_take(
         if view is not None:
             recording = view.recording(recording, body, take.person, settings)
         if take.pose is not None:
-            recording = from_afar(recording, body, settings, low_pass=take.pose.low_pass)
+            recording = with_fitted_start(recording, body, settings, low_pass=take.pose.low_pass)
         labels = label_findings_of(take, seen, body, refuse=True)
         followed = recording.followed.keypoints if recording.followed else ()
         findings = (*labels, *input_findings(take, seen, followed, body))

@@ -179,7 +179,7 @@ def _clicked_on_person(frames: Sequence[Any], i: int, seen: Observations, of_per
     return out
 
 
-def from_afar(
+def with_fitted_start(
     recording: Recording, body: Body, settings: TrackSettings | None, *, low_pass: bool = True
 ) -> Recording:
     """A recording whose start, which may be tens of degrees off, is fitted to the silhouettes of its step."""
