@@ -91,7 +91,7 @@ def look_at(eye: NDArray, target: NDArray, up: NDArray) -> NDArray:
     return T
 
 
-def beside(camera: Camera, name: str, baseline: float) -> Camera:
+def shifted_camera(camera: Camera, name: str, baseline: float) -> Camera:
     """The same camera, `baseline` [m] to its right: the second of a stereo head."""
     T = np.eye(4)
     T[0, 3] = -baseline
