@@ -1,4 +1,4 @@
-"""Rows of docs/papers, each tried once: `python -m benchmarks.papers`; their values: `python -m benchmarks.papers --fill`.
+"""Rows of docs/papers, tried once: `python -m benchmarks.papers`; their values: `python -m benchmarks.papers --fill`.
 
 A page a paper has a heading a row. The parts of benchmarks that a row names run in their quick form; a row that names
 none is tried by its tests. The quick form of this area runs neither, as the other areas and the tests do: it checks

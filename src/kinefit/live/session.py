@@ -94,7 +94,7 @@ class LiveSession:
         self.processed = self.found = 0
         self.latencies: deque[float] = deque(maxlen=_MAX_LATENCIES)
         self.requests: queue.Queue[tuple[ClientRequest, Answer]] = queue.Queue(_MAX_WAITING_REQUESTS)
-        self._replaced: tuple[Body, ClientRequest, Answer] | None = None  # until a step is fitted with the requested body
+        self._replaced: tuple[Body, ClientRequest, Answer] | None = None  # until a step is fitted with that body
         self._off: set[str] = set()
         self._choices = 0  # of another person
         self._paused = self._over = False

@@ -1,4 +1,4 @@
-"""The stage: a server with a scene, floor, cameras with their images, what stands behind the person."""
+"""Server of a 3D scene: floor, cameras with their images, and the image behind the person."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ _MIN_DISTANCE = 1.0  # [m] of the first look: parts of a body are not seen from 
 
 
 def open_server(port: int, access: Access | None = None, *, label: str = "kinefit") -> viser.ViserServer:
-    """A server on a port, or on the next one that is free; `get_port()` tells which.
+    """A server on a port, or on the next one that is free; `get_port()` returns its number.
 
     Parameters
     ----------

@@ -385,7 +385,7 @@ class KeypointMatched(Matched):
         return size * gap, size * channels.sigma
 
     def _elsewhere(self, right: NDArray, wrong: NDArray) -> NDArray | None:
-        """(S,) bool: segments whose own points most views show view_offset where they should be, two of them in one place.
+        """(S,) bool: segments whose points most views show elsewhere, two of these views in one place.
 
         A joint's point counts for the segment beyond the joint alone: an elbow may be off where shoulder and hand are
         right.

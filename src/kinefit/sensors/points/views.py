@@ -84,7 +84,7 @@ class ViewBias:
 def view_offset(
     coefficients: NDArray, trunk: NDArray, x_world: NDArray, frames: NDArray, rig: Rig, camera: NDArray
 ) -> NDArray:
-    """(N, 2) [px] how far view_offset their points keypoints are seen; 0 where a point cannot be seen.
+    """Offsets (N, 2) [px] at which keypoints are seen from their points; 0 where a point cannot be seen.
 
     Parameters
     ----------
