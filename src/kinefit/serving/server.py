@@ -61,7 +61,7 @@ class Page(NamedTuple):
 
 
 class Allowance:
-    """A number of things that may happen at once, and grows again at a rate."""
+    """Token bucket: a burst of events, refilled at a constant rate."""
 
     def __init__(self, at_once: float, per_second: float) -> None:
         self._left = self._most = at_once

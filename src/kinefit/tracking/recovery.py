@@ -60,7 +60,7 @@ class Searching(Protocol):
 
 
 class Recovery:
-    """Searches of one tracker: when the last one was, and since when something is lost.
+    """Searches of one tracker: time of the last search, and since when a segment is lost.
 
     Parameters
     ----------
@@ -263,7 +263,7 @@ class Recovery:
         return not (hidden & seek & trunk).any() and not any(hidden[limb].all() for limb in sought)
 
     def _leap(self, time: float, old: FrameResult, new: FrameResult, seek: NDArray) -> float:
-        """How much faster than a brisk wave a limb would have moved since it was last seen where it was, 1 at least."""
+        """Speed of a limb's jump from its last observed place, over that of a brisk wave; at least 1."""
         elapsed = max(float(np.abs(time - self._good[seek]).max()), 1.0 / self.rate)
         points = self.body.landmarks
         gone = self.body.positions(new.state, points) - self.body.positions(old.state, points)

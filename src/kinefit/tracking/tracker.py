@@ -123,7 +123,7 @@ class Tracker:
         return self.sensors.sigma
 
     def know_background(self, sensor: str, depth: NDArray) -> None:
-        """State what a depth camera sees when nobody is there: (H, W) [m], 0 where that is not known.
+        """Set the empty scene of a depth camera: (H, W) [m], 0 where unknown.
 
         Raises
         ------

@@ -31,7 +31,7 @@ _MAX_CACHE_BYTES = 96_000_000  # bytes of pictures that are kept
 
 @dataclass(frozen=True, eq=False)
 class PinholeView:
-    """What a camera sees, as a flat picture: a pinhole with its axis in the middle that covers the whole image.
+    """A camera's view without distortion: a centred pinhole camera that covers the whole image.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def flatten(picture: NDArray[np.uint8], pixels: NDArray) -> NDArray[np.uint8]:
 
 
 class CameraImages:
-    """Flat pictures of cameras over time, decoded on demand; the last ones are kept.
+    """Undistorted images of cameras over time, decoded on demand; the last ones are cached.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Checkpoints of a run: after a crash the next run resumes from the last one, to the same result bit for bit.
 
-A folder holds a `FrameFile`, a table of the finished frames for users, and a lock. What is written is read back at once
-and used, so an interrupted run computes with the same numbers as an uninterrupted one. Nothing that is read is executed.
+A folder holds a `FrameFile`, a table of the finished frames for users, and a lock. What is written is read back at
+once and used, so an interrupted run computes with the same numbers as an uninterrupted one. Nothing is executed.
 """
 
 from __future__ import annotations
