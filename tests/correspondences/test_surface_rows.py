@@ -10,7 +10,7 @@ from kinefit.correspondences.anchored import anchored
 from kinefit.errors import ObservationError
 
 BODY = load_body("humanoid10")
-STATE = BODY.usual_state()
+STATE = BODY.default_state()
 
 
 def cloud(count=400, seed=0):

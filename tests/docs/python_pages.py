@@ -29,7 +29,7 @@ def anny(folder):
     space = yield {"rig": w.rig}
     model = space["model"]
     body = model.body(model.of_stature(1.8))
-    states = [body.usual_state()] * 2
+    states = [body.default_state()] * 2
     yield {"rig": w.rig, "steps": pixels(body, states, w.rig), "states": states}
 
 
@@ -96,7 +96,7 @@ def morphing(folder):
     man = skinned.body
     target = np.array(skinned.mesh.vertices) * (1.0, 1.0, 1.1)
     yield {"man": man, "target": target, "local_morphs": (), "arm": body}
-    yield {"state": man.usual_state(), "nodes": np.arange(3), "directions": np.tile((0.0, 1.0, 0.0), (3, 1))}
+    yield {"state": man.default_state(), "nodes": np.arange(3), "directions": np.tile((0.0, 1.0, 0.0), (3, 1))}
 
 
 def motion(folder):
@@ -212,7 +212,7 @@ def stereo(folder):
     space = yield {"rig": rig, "left_image": left, "right_image": right, "time": 0.0}
     assert np.isfinite(space["frame"].depth).any()
     body = load_body("humanoid")
-    yield {"body": body, "state": body.usual_state()}
+    yield {"body": body, "state": body.default_state()}
 
 
 def surfaces(folder):
@@ -250,7 +250,7 @@ def view(folder):
 def voodoo(folder):
     w = world()
     body = load_body("humanoid10")
-    start = body.usual_state()
+    start = body.default_state()
     x = drawn.skin_points(body, start)
     stream = [[PointCloud("tof", 0.0, x)]]
     yield {"stream": stream, "body": body, "start": start, "rig": Rig((w.depth_camera,))}

@@ -157,7 +157,7 @@ def portrait(body: Body, azimuth: float = 40.0, size: tuple[int, int] = (900, 90
     """
     if not body.surfaces:
         raise BodyError(f"body '{body.name}' has no surfaces to render", remedy="Add a surface to its segments.")
-    state = closed_poses(body, most=1)[0] if body.closures else body.usual_state()
+    state = closed_poses(body, most=1)[0] if body.closures else body.default_state()
     motion = known_motion(body, 1.0, state.T_world_root[None], state.angles[None])
     frames, _ = body.tree.forward(state.T_world_root, state.angles)
     points_of_limbs = [

@@ -165,7 +165,7 @@ class Recovery:
         result: FrameResult | None,
     ) -> FrameResult | None:  # fmt: skip
         """A start from points that are known in space, which costs little; from rays as often as a search runs."""
-        scene = tracker.scene_of(self.body.usual_state(np.eye(4)), time)
+        scene = tracker.scene_of(self.body.default_state(np.eye(4)), time)
         known = measurements or tracker.sensors.measurements(frames, scene, points=True)
         rays = result is None or abs(time - self._sought) >= self.settings.search_every - 0.25 / self.rate
         for state in starts_from_points(self.body, known, scene, self.up, rays=rays):
@@ -180,7 +180,7 @@ class Recovery:
         search: PostureSearch | None = None,
     ) -> FrameResult | None:  # fmt: skip
         """A start from what shows a whole person; `search`, where much about the result is left out by it."""
-        state, own = self.body.usual_state(np.eye(4)), tracker.sensors
+        state, own = self.body.default_state(np.eye(4)), tracker.sensors
         scene = tracker.scene_of(state, time).at(state, others=tracker.others)
         elapsed = abs(time - self._good[0])
         known = self._root if elapsed <= _TURN + 1e-6 else None

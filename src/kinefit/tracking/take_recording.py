@@ -254,7 +254,7 @@ def posed_start(take: Take, body: Body, frames: tuple[int, int]) -> tuple[int, B
     T[:3, 2] = z / np.linalg.norm(z)
     T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
     T[:3, 3] = pose.at
-    angles = np.array(body.usual_state(T).angles)
+    angles = np.array(body.default_state(T).angles)
     for name, value in pose.angles.items():
         if name not in tree.coordinates:
             raise wrong(choices(f"angle of body '{body.name}'", name, tree.coordinates))

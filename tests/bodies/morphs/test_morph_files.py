@@ -192,7 +192,7 @@ def test_a_part_goes_with_its_morphs():
         body = without_part(body, name)
     kinds = [type(m) for m in body.morphs if m.steering.coordinate.endswith("_r")]
     assert kinds == [JointMotion, LocalMorph] and sum(isinstance(m, SegmentMorph) for m in body.morphs) == 1
-    Morphing(body).pose(body.usual_state())
+    Morphing(body).pose(body.default_state())
 
 
 def test_the_docs_example_is_a_body():
