@@ -152,8 +152,7 @@ class Body:
         """State in the default posture, from which fits start; T_world_root (4, 4) [m], default the identity."""
         return BodyState(np.eye(4) if T_world_root is None else T_world_root, self.tree.usual)
 
-    usual_state = default_state
-    """The name in version 0.2."""
+    usual_state = default_state  # the name in version 0.2
 
     def rest_state(self, T_world_root: NDArray | None = None) -> BodyState:
         """State with all angles zero, or at the nearest limit; T_world_root (4, 4) [m], default the identity."""

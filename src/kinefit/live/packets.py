@@ -127,7 +127,6 @@ def read_request(given: bytes | Mapping[str, Any]) -> ClientRequest:
     except msgspec.DecodeError as error:
         raise ObservationError(f"not a request: {error}", remedy=_FORM) from error
     asked = {name for name in request.__struct_fields__ if getattr(request, name) is not None}
-    allowed = {"sensor", "use"}, {"sensor", "sigma"}, *({one} for one in _SINGLE_FIELDS)
-    if asked not in allowed or request.stop is False:
+    if asked not in ({"sensor", "use"}, {"sensor", "sigma"}, *({f} for f in _SINGLE_FIELDS)) or request.stop is False:
         raise ObservationError(f"a message with {', '.join(sorted(asked)) or 'nothing'} is not a request", remedy=_FORM)
     return request

@@ -232,9 +232,7 @@ class PackedPixels(PackedPoints):
         weight = self.confidence[f] / np.square(self.channels.sigma)
         uv = np.where(weight[:, None] > 0, self.values[f], np.nan)
         return tuple(
-            replace(
-                m, uv=uv, weight=weight, swapped=self.swapped[f], view_offset=m.measurement.layout.view_offset(scene)
-            )
+            replace(m, uv=uv, weight=weight, swapped=self.swapped[f], view_offset=m.measurement.layout.bias(scene))
             for m in pixels_of(tracked)
         )
 

@@ -14,8 +14,7 @@ from kinefit.geometry.se3 import nearest_rotation
 
 def nan_median(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
     """Median along an axis, without NaN; NaN, with no warning, if all are NaN."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         median = np.nanmedian if np.isnan(values).any() else np.median  # the same, several times as fast
         return np.asarray(median(values, axis=axis))
 

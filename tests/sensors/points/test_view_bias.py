@@ -71,7 +71,7 @@ def test_a_known_bias_is_taken_out_of_the_fit_and_not_of_what_was_measured():
     given = channels.uv[5], channels.confidence[5], 0.0
     plain = KeypointMeasurement(sensor, Layout(channels, BODY), *given).match(scene, 0.03)
     known = KeypointMeasurement(sensor, layout, *given).match(scene, 0.03)
-    shift = layout.view_offset(scene)
+    shift = layout.bias(scene)
     assert np.abs(shift).max() > 3.0
     np.testing.assert_allclose(known.uv, plain.uv - shift, atol=1e-9)
     for a, b in zip(known.leftovers(scene), plain.leftovers(scene)):

@@ -87,7 +87,7 @@ class Layout:
         """(N,) segment in whose frame a channel's view bias is given."""
         return trunks(self.body.tree)[self.points.segments]
 
-    def view_offset(self, scene: Scene) -> NDArray | None:
+    def bias(self, scene: Scene) -> NDArray | None:
         """(N, 2) [px] bias of each keypoint in the image at a scene's state; None without a `view_bias`."""
         bias = self.channels.view_bias
         if bias is None:
@@ -246,7 +246,7 @@ class KeypointMeasurement(Measurement):
         """Left and right of each source as they fit the body better; which points another sensor saw to be hidden."""
         channels = self.layout.channels
         fitted = projected(scene, self.layout)
-        view_offset = self.layout.view_offset(scene)
+        view_offset = self.layout.bias(scene)
         looked_for = fitted if view_offset is None else fitted + view_offset
         swapped = find_swaps(channels, self.layout.groups, self.uv, self.weight, looked_for, self.sides_known)
         order = np.where(swapped, channels.partner, np.arange(len(swapped)))
