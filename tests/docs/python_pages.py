@@ -30,7 +30,9 @@ def anny(folder):
     model = space["model"]
     body = model.body(model.of_stature(1.8))
     states = [body.default_state()] * 2
-    yield {"rig": w.rig, "steps": pixels(body, states, w.rig), "states": states}
+    assert load_body("person.npz").skin is not None
+    space = yield {"rig": w.rig, "steps": pixels(body, states, w.rig), "states": states}
+    assert space["found"].value("anny gender")[1] > 0.0
 
 
 def batch(folder):

