@@ -26,10 +26,10 @@ from benchmarks.bar_scene import (
     write_corners,
 )
 from benchmarks.figures import amount, data, figure
-from kinefit.calibration.bar.calibrate import BarCalibration, calibrate_bar
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.lines import triangulate
 from kinefit.geometry.se3 import log_so3
+from kinefit.rigs.bar.calibrate import BarCalibration, calibrate_bar
 
 _NOISE, _LENGTH, _PLACES, _ROOMS = 0.1, 0.9, 300, 40
 

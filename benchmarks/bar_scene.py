@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
-from kinefit.calibration.bar.targets import BarViews
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import exp_so3, log_so3, transform
+from kinefit.rigs.bar.targets import BarViews
 
 
 @checked

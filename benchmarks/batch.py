@@ -20,9 +20,9 @@ import numpy as np
 
 from benchmarks.figures import amount, figure
 from benchmarks.long import write_long_take
-from kinefit.batch.cluster import run_there
-from kinefit.batch.one import Choices, TakeJob
-from kinefit.batch.summary import RECORD, Row
+from kinefit.takes.batch.cluster import run_there
+from kinefit.takes.batch.one import Choices, TakeJob
+from kinefit.takes.batch.summary import RECORD, Row
 
 TAKES = 10_000
 """Takes that the scheduler of Dask gets."""

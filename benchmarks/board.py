@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.figures import amount, data, figure
-from kinefit.calibration.board.calibrate import BoardCalibration, calibrate_board
-from kinefit.calibration.board.detection import Board
-from kinefit.calibration.board.sources import camera_sources, find_boards
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import read_calibration
+from kinefit.rigs.board.calibrate import BoardCalibration, calibrate_board
+from kinefit.rigs.board.detection import Board
+from kinefit.rigs.board.sources import camera_sources, find_boards
 
 _WEBCAMS = {"mv4_upperbody_caliscope": "", "mv4_landmarks_caliscope": "calibration/extrinsic"}
 

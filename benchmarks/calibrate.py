@@ -19,13 +19,13 @@ from benchmarks.motions import library
 from benchmarks.static_points import HIGH, static_residual
 from benchmarks.tracking import DETECTORS, NOISE, TRIAL, Trial, held_out, median_residual, middle, read_trial
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, track
-from kinefit.calibration.people.calibrate import calibrate_people
-from kinefit.calibration.refine.gauge import aligned
-from kinefit.calibration.refine.refine import refine
-from kinefit.calibration.refine.result import Refinement
 from kinefit.geometry import se3
 from kinefit.geometry.lines import triangulate
 from kinefit.readers.calibration.read import read_calibration
+from kinefit.rigs.people.calibrate import calibrate_people
+from kinefit.rigs.refine.gauge import aligned
+from kinefit.rigs.refine.refine import refine
+from kinefit.rigs.refine.result import Refinement
 from kinefit.simulation import cut, simulate_keypoints, studio_rig
 
 RESIDUAL = {"openpose": 7.0, "mediapipe": 9.0}

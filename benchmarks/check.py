@@ -14,9 +14,9 @@ from benchmarks.figures import data, figure
 from benchmarks.motions import library
 from benchmarks.tracking import DETECTORS, NOISE, TRIAL, take_text
 from kinefit import Keypoints, Motion, Rig
-from kinefit.diagnostics.checks import Checked, check_keypoints
-from kinefit.diagnostics.timing import time_offsets
-from kinefit.diagnostics.views import make_views, with_sides_right
+from kinefit.fitting.multiview.views import make_views, with_sides_right
+from kinefit.rigs.diagnostics.checks import Checked, check_keypoints
+from kinefit.rigs.diagnostics.timing import time_offsets
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.takes.check import check_take
 

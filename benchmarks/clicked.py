@@ -16,9 +16,9 @@ from benchmarks.surface_body import cameras, moving_arm
 from benchmarks.video_bodies import CLICKS, SETUPS, another
 from benchmarks.video_bodies import cameras as cameras_of_video
 from kinefit.bodies import Body, BodyState, load_body
+from kinefit.fitting.initialization.from_clicks import clickable, clicked_points, clicked_start
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.se3 import log_so3
-from kinefit.initialization.from_clicks import clickable, clicked_points, clicked_start
 from kinefit.simulation import squat_and_wave, studio_rig
 
 NOISE = 3.0  # [px]

@@ -16,10 +16,10 @@ from benchmarks.closures_takes import RATE, Take, from_drive, towards
 from benchmarks.figures import amount, figure
 from kinefit.bodies import Body, load_body
 from kinefit.bodies.closures import Closure
-from kinefit.motion import Motion
-from kinefit.rows import ParameterRows
-from kinefit.smoothing.foot_contacts import find_contacts
-from kinefit.tracking.video import track
+from kinefit.bodies.motion import Motion
+from kinefit.fitting.smoothing.foot_contacts import find_contacts
+from kinefit.fitting.tracking.video import track
+from kinefit.solving.rows import ParameterRows
 
 SEEDS = (11, 12, 13)
 STANDS = 0.005

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.closures_takes import snowboarder
 from benchmarks.figures import amount, figure
-from kinefit.tracking.video import track
+from kinefit.fitting.tracking.video import track
 
 SEEDS = (11, 12, 13, 14, 15, 16)
 STD = {"boot distance": 0.06, "boot angle": np.radians(10.0)}

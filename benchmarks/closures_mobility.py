@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from benchmarks.figures import figure
 from kinefit.bodies import catalogue, load_body
-from kinefit.solvers.mobility import mobility
+from kinefit.solving.mobility import mobility
 
 
 def run() -> None:

@@ -14,8 +14,8 @@ from scipy.optimize import least_squares
 
 from benchmarks.closures_takes import Take, cyclist, snowboarder
 from benchmarks.figures import amount, figure
-from kinefit.motion import Motion
-from kinefit.tracking.video import track
+from kinefit.bodies.motion import Motion
+from kinefit.fitting.tracking.video import track
 
 SEEDS = (11, 12, 13)
 LEFT = ("shank_l", "foot_l", "toes_l")

@@ -13,12 +13,12 @@ from scipy.optimize import minimize_scalar
 
 from benchmarks.figures import amount, figure
 from kinefit.bodies import Body, BodyState, parse_body
-from kinefit.correspondences import point_rows
-from kinefit.correspondences.closures import closed_at, hard_equations
-from kinefit.rows import AnyRows
-from kinefit.solvers.closed import closed_fit, onto
-from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.mobility import mobility
+from kinefit.solving.closed import closed_fit, onto
+from kinefit.solving.correspondences import point_rows
+from kinefit.solving.correspondences.closures import closed_at, hard_equations
+from kinefit.solving.least_squares import levenberg_marquardt
+from kinefit.solving.mobility import mobility
+from kinefit.solving.rows import AnyRows
 
 UNIT = 0.15
 """[m]"""

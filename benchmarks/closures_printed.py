@@ -17,12 +17,12 @@ from benchmarks.closures_planar import UNIT, explicit, pedal
 from benchmarks.figures import amount, figure
 from kinefit.bodies import Body, BodyState, TaperedCylinder, load_body
 from kinefit.bodies.parts import known_gear
-from kinefit.correspondences.closures import closure_values, hard_equations
+from kinefit.bodies.rendering import render_body
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.recipes.regions import pose_from_regions
-from kinefit.rendering import render_body
-from kinefit.solvers.closed import onto
+from kinefit.papers.regions import pose_from_regions
+from kinefit.solving.closed import onto
+from kinefit.solving.correspondences.closures import closure_values, hard_equations
 
 AWAY = 0.15  # [rad] of the crank, from the start to the pose that is seen
 CRANKS = (-2.6, -1.6, 0.6, 1.4, 2.0, 2.6)  # [rad], away from the stretched leg at 0

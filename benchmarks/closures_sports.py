@@ -31,11 +31,11 @@ from benchmarks.figures import amount, figure, quick
 from kinefit.bodies import Body, load_body
 from kinefit.bodies.closures import Closure
 from kinefit.bodies.parts import with_dimensions
-from kinefit.rows import ParameterRows
+from kinefit.fitting.subject.keypoints import fit_subject
+from kinefit.fitting.tracking.sizing import channels_of
+from kinefit.fitting.tracking.video import track
 from kinefit.sensors.settings import TrackSettings
-from kinefit.subject.keypoints import fit_subject
-from kinefit.tracking.sizing import channels_of
-from kinefit.tracking.video import track
+from kinefit.solving.rows import ParameterRows
 
 SEEDS = (11, 12)
 POINTS = "MEDIAPIPE_33"

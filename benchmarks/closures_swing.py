@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.figures import amount, data, figure
+from kinefit.bodies.motion import Motion
 from kinefit.exporters.c3d_file import write_markers
-from kinefit.motion import Motion
 from kinefit.readers.markers import read_markers
 from kinefit.takes.track import track_take
 

@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.closures import Closure
+from kinefit.bodies.motion import Motion
 from kinefit.bodies.parts import with_dimensions
-from kinefit.correspondences import prior_rows
-from kinefit.correspondences.closures import closed_at
+from kinefit.fitting.tracking.recording import Recording
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Motion
-from kinefit.rows import AnyRows, DofRows, ParameterRows
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import simulate_keypoints, studio_rig
-from kinefit.solvers.closed import CLOSED, closed_fit
-from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.tracking.recording import Recording
+from kinefit.solving.closed import CLOSED, closed_fit
+from kinefit.solving.correspondences import prior_rows
+from kinefit.solving.correspondences.closures import closed_at
+from kinefit.solving.least_squares import levenberg_marquardt
+from kinefit.solving.rows import AnyRows, DofRows, ParameterRows
 
 _SIDE = re.compile("^[LR](?=[A-Z])|left|right")
 LEG = ("LKnee", "LAnkle", "LBigToe", "LSmallToe", "LHeel")

@@ -23,15 +23,15 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure
 from kinefit import load_body, track_take
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.motion import BELIEVED, Motion
 from kinefit.bodies.surfaces import TaperedCylinder
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.bodies.surfaces.triangles import BodyMesh
-from kinefit.correspondences import collision_rows
 from kinefit.geometry.camera import Camera
-from kinefit.motion import BELIEVED, Motion
 from kinefit.simulation.rendering.scenes import SimulatedScene
 from kinefit.simulation.rendering.sensors import DepthSensor, measured_depth
 from kinefit.simulation.retarget import known_motion
+from kinefit.solving.correspondences import collision_rows
 
 SR305 = DepthSensor(
     "sr305", (640, 480), 476.0, 0.2, 1.5, (0.001, 0.002, 0.2), oblique=0.5, grazing=0.2, baseline=0.026, lateral=0.7,

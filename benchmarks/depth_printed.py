@@ -25,10 +25,10 @@ import numpy as np
 
 from benchmarks.figures import amount, figure
 from kinefit.bodies import BodyState
-from kinefit.evaluation.sequences import Inputs, TruthSequence, sequence_of, sequences, with_hands
-from kinefit.evaluation.voodoo import POINTS, Summary, evaluate, point_errors, voodoo_method
-from kinefit.motion import Motion
-from kinefit.recipes.voodoo import Settings
+from kinefit.bodies.motion import Motion
+from kinefit.papers.voodoo import Settings
+from kinefit.simulation.evaluation.sequences import Inputs, TruthSequence, sequence_of, sequences, with_hands
+from kinefit.simulation.evaluation.voodoo import POINTS, Summary, evaluate, point_errors, voodoo_method
 from kinefit.simulation.movements import Performer, movement, people
 
 HELD_OUT = 1  # seed of people and errors

@@ -77,7 +77,7 @@ def _camera(focal: float, cx: float, cy: float) -> Any:
 def fitted(images: list[NDArray], camera: Any) -> Any:
     """(depth, camera, start, body) of every image."""
     from kinefit import load_body
-    from kinefit.initialization.from_depth import sized_start, start_from_points
+    from kinefit.fitting.initialization.from_depth import sized_start, start_from_points
 
     fit, _ = sized_start(load_body("humanoid10"), images[:_SIZED], camera, up=_UP)
     for depth in images:
@@ -86,7 +86,7 @@ def fitted(images: list[NDArray], camera: Any) -> Any:
 
 def explained(body: Any, state: Any, camera: Any, depth: NDArray) -> tuple[NDArray, float]:
     """Distances (N,) [m] of accepted points from the visible surface, and the share of all that are close to it."""
-    from kinefit.bodies.body_surfaces import nearest
+    from kinefit.bodies.surfaces.places import nearest
     from kinefit.images.depth import to_points
 
     points = to_points(depth, camera, step=3)
@@ -100,8 +100,8 @@ def picture(body: Any, state: Any, camera: Any, depth: NDArray) -> NDArray:
     """(H, 2 W, 3) uint8: depth in colours, and beside it the body drawn over it."""
     import cv2
 
-    from kinefit.bodies.body_surfaces import body_mesh
-    from kinefit.rendering import render_body
+    from kinefit.bodies.rendering import render_body
+    from kinefit.bodies.surfaces.places import body_mesh
 
     mesh = body_mesh(body)
     raster = render_body(body, state, camera, mesh=mesh)

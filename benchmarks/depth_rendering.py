@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import figure
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.rendering import Canvas, render_body
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.geometry.camera import Camera
-from kinefit.rendering import Canvas, render_body
 from kinefit.simulation import KINECT, TOF, in_front, squat_and_wave
 
 REPEATS, FRAMES = 7, 20

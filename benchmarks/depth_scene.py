@@ -42,7 +42,7 @@ _GOALS = (
 
 def tracker(body: Any, rig: Any, rate: float) -> Any:
     """What is measured: the tracker as it comes."""
-    from kinefit.tracking.tracker import Tracker
+    from kinefit.fitting.tracking.tracker import Tracker
 
     return Tracker(body, rig, rate=rate, up="y")
 

@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
 from kinefit.bodies import PointSet
-from kinefit.evaluation.sequences import TruthSequence, sequence
-from kinefit.evaluation.voodoo import voodoo_method
+from kinefit.bodies.motion import Motion
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry import se3
-from kinefit.motion import Motion
 from kinefit.observations import BodyTrackerFrame
-from kinefit.rows import Rows
 from kinefit.sensors.base import rows_at
 from kinefit.sensors.points.body_trackers import BodyTrackerSensor
+from kinefit.simulation.evaluation.sequences import TruthSequence, sequence
+from kinefit.simulation.evaluation.voodoo import voodoo_method
 from kinefit.simulation.movements import people
-from kinefit.tracking.tracker import Tracker
+from kinefit.solving.rows import Rows
 
 SIGMA, TURN = 0.005, np.radians(2.0)  # [m], [rad] of the tracker on the body
 AXES = ("along", "across", "toward the camera")

@@ -127,8 +127,8 @@ class Stage:
 
     def follow(self, frames: Sequence[Any], points: int = POINTS) -> tuple[NDArray, list[Any]]:
         """CPU time [ms] and result of each frame, from the second frame of the movement on."""
+        from kinefit.fitting.tracking.tracker import Tracker
         from kinefit.sensors.settings import TrackSettings
-        from kinefit.tracking.tracker import Tracker
 
         settings = TrackSettings(points=points, search=False)
         tracker = Tracker(
@@ -152,7 +152,7 @@ class Stage:
 
 def _fusion(folder: Path) -> dict[str, float]:
     """Time and error with 5,000 points of the body a frame; the clouds are left in the folder."""
-    from kinefit.bodies.body_surfaces import sample
+    from kinefit.bodies.surfaces.places import sample
 
     least, first, iterations, error = [], [], [], []
     told: dict[str, Any] = {}

@@ -69,7 +69,7 @@ def seen(body: Any, states: list[Any], camera: Any, sensor: Any, *, room: bool) 
 
 
 def _motion(body: Any, states: list[Any]) -> Any:
-    from kinefit.motion import Motion
+    from kinefit.bodies.motion import Motion
 
     roots, angles = np.array([s.T_world_root for s in states]), np.array([s.angles for s in states])
     count, parts = len(states), len(body.tree.segments)
@@ -88,7 +88,7 @@ def joints(body: Any, state: Any) -> NDArray:
 
 
 def _recovered(body: Any) -> None:
-    from kinefit.initialization.from_depth import start_from_points
+    from kinefit.fitting.initialization.from_depth import start_from_points
     from kinefit.simulation.rendering.sensors import KINECT
 
     camera = camera_in_front(KINECT)
@@ -112,7 +112,7 @@ def _recovered(body: Any) -> None:
 
 def _movements(sensor: str) -> None:
     """Twenty people in the midst of ten movements, in a room with a table, as a sensor of that kind sees them."""
-    from kinefit.initialization.from_depth import start_from_points
+    from kinefit.fitting.initialization.from_depth import start_from_points
 
     found = []
     for person, state, camera, depth in moving(sensor, _PEOPLE):
@@ -148,9 +148,9 @@ def _size(body: Any) -> None:
     from dataclasses import replace
 
     from kinefit.bodies.surfaces import TaperedCylinder
+    from kinefit.fitting.subject.depth import fit_surfaces
     from kinefit.sensors.surfaces.depth_view import view_of
     from kinefit.simulation.rendering.sensors import KINECT
-    from kinefit.subject.depth import fit_surfaces
 
     camera, before, after = camera_in_front(KINECT), [], []
     for seed in range(amount(4, 1)):

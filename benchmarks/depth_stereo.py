@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, data, figure
 from kinefit.bodies import load_body
-from kinefit.bodies.body_surfaces import sample
-from kinefit.correspondences import collision_rows, free_space_rows
-from kinefit.correspondences.occupancy.collisions import collision_pairs
-from kinefit.correspondences.occupancy.depth_image import SurfaceSamples
-from kinefit.correspondences.occupancy.free_space import FreeSpace
+from kinefit.bodies.surfaces.places import sample
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.images.stereo import StereoRectifier
 from kinefit.readers.calibration.read import read_opencv_stereo
+from kinefit.solving.correspondences import collision_rows, free_space_rows
+from kinefit.solving.correspondences.occupancy.collisions import collision_pairs
+from kinefit.solving.correspondences.occupancy.depth_image import SurfaceSamples
+from kinefit.solving.correspondences.occupancy.free_space import FreeSpace
 
 PAIRS = amount((1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14), (1, 5, 9))
 SQUARE = 0.025  # [m]
@@ -133,9 +133,9 @@ def _skin() -> None:
         "skin, CPU",
     )
     try:
-        from kinefit import assets
         from kinefit.errors import KinefitError
         from kinefit.images.detectors.box_detector import Models
+        from kinefit.readers import assets
 
         if folder is None:
             raise FileNotFoundError("no recording")
@@ -157,7 +157,7 @@ def _gestures(folder: Path, port: int, models: object) -> tuple[NDArray, float]:
     """(N, 2): 0 for the face and 1 for a hand, and how far it is from where the networks see it; NaN for unseen."""
     from kinefit.images.detectors.detection import Follower
     from kinefit.images.detectors.skin import SkinTracker, find_face
-    from kinefit.readers.video import Video
+    from kinefit.readers.videos.video import Video
 
     follower, rows, times = Follower(models, 6.0, people=1, masks=False), [], []  # type: ignore[arg-type]
     with Video(folder / f"port_{port}.mp4") as video:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import figure
 from kinefit.bodies import load_body
-from kinefit.bodies.body_surfaces import sample
 from kinefit.bodies.surfaces.closest._kernels_cylinder import nearest_on_cylinders, nearest_on_cylinders_exact
+from kinefit.bodies.surfaces.places import sample
 
 COUNT, BOUND, NOISE = 5000, 0.1, 0.02  # points; [m]; [m]
 

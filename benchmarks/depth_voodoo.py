@@ -19,10 +19,10 @@ import numpy as np
 
 from benchmarks.figures import amount, figure, quick
 from kinefit.bodies import Body, BodyState, TaperedCylinder
-from kinefit.evaluation.sequences import Inputs, TruthSequence, sequences
-from kinefit.evaluation.voodoo import METHODS, Summary, conclusions, evaluate, voodoo_method
-from kinefit.motion import Motion
-from kinefit.recipes.voodoo import Settings
+from kinefit.bodies.motion import Motion
+from kinefit.papers.voodoo import Settings
+from kinefit.simulation.evaluation.sequences import Inputs, TruthSequence, sequences
+from kinefit.simulation.evaluation.voodoo import METHODS, Summary, conclusions, evaluate, voodoo_method
 from kinefit.simulation.rendering.sensors import KINECT, TOF
 
 KINECT_COUNT = amount(20, 1)  # each movement and each person twice: images of 640 x 480 take long to simulate

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.body_surfaces import body_mesh
-from kinefit.evaluation.sequences import INPUTS, TruthSequence, sequence
-from kinefit.evaluation.voodoo import voodoo_method
+from kinefit.bodies.rendering import render_body
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.geometry.camera import Camera
-from kinefit.rendering import render_body
+from kinefit.simulation.evaluation.sequences import INPUTS, TruthSequence, sequence
+from kinefit.simulation.evaluation.voodoo import voodoo_method
 from kinefit.simulation.movements import people
 from kinefit.simulation.rendering.scenes import ColourSensor, SimulatedScene, picture
 

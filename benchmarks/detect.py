@@ -11,16 +11,16 @@ import cv2
 import numpy as np
 
 from benchmarks.figures import amount, data, figure, quick
-from kinefit.assets import CAMERAS
 from kinefit.errors import AssetError, ObservationError
+from kinefit.fitting.multiview.association import choose_people
 from kinefit.geometry.camera import ImageFrame
 from kinefit.geometry.lines import triangulate
 from kinefit.images.detectors.roi import MIRROR
-from kinefit.multiview.association import choose_people
 from kinefit.observations import Detections
-from kinefit.preparing import detecting
+from kinefit.readers.assets import CAMERAS
 from kinefit.readers.calibration.read import read_calibration
-from kinefit.readers.detections import read_detections
+from kinefit.readers.landmarks.detections import read_detections
+from kinefit.takes.preparing import detecting
 
 _GOALS = {
     "detect_speed": ("frames/s", ">= 12"), "detect_landmarks_difference": ("px", "<= 4"),

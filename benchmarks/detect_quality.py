@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, data, figure
-from kinefit.assets import CAMERAS
 from kinefit.errors import AssetError, ObservationError
+from kinefit.fitting.multiview.association import choose_people
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.geometry.lines import triangulate
 from kinefit.images.detectors.roi import MIRROR
-from kinefit.multiview.association import choose_people
-from kinefit.preparing import detecting
+from kinefit.readers.assets import CAMERAS
 from kinefit.readers.calibration.read import read_calibration
-from kinefit.readers.detections import read_detections
+from kinefit.readers.landmarks.detections import read_detections
+from kinefit.takes.preparing import detecting
 
 _GOALS = {"median": ("px", "<= 11"), "mean": ("px", "<= 13"), "exchanged": ("pictures", "== 0")}
 _OTHERS = 2  # cameras that must see a landmark to place it

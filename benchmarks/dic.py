@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import LEFT_OUT, amount, data, figure, peers, quick
 from benchmarks.peers.environments import run_peer
-from kinefit.photogrammetry.least_squares_matching import Matches
-from kinefit.photogrammetry.region_growing import Grid, Seeds, grow
-from kinefit.photogrammetry.spline_image import SplineImage
-from kinefit.photogrammetry.strain import Strain, strain
+from kinefit.images.photogrammetry.least_squares_matching import Matches
+from kinefit.images.photogrammetry.region_growing import Grid, Seeds, grow
+from kinefit.images.photogrammetry.spline_image import SplineImage
+from kinefit.images.photogrammetry.strain import Strain, strain
 
 WINDOWS = (13, 21, 35)
 STEP, EDGE = 10, 20  # [px] of the grid, and of its first windows' borders from the edges

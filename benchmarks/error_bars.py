@@ -14,9 +14,9 @@ import numpy as np
 from benchmarks.figures import amount, figure
 from benchmarks.motions import library
 from kinefit import Keypoints, Motion, Recording, load_body, track
-from kinefit.evaluation import ErrorBarCoverage, coverage_of_groups
 from kinefit.simulation import simulate_keypoints, studio_rig
-from kinefit.solvers.bundle.shape import mirror_points
+from kinefit.simulation.evaluation import ErrorBarCoverage, coverage_of_groups
+from kinefit.solving.bundle.shape import mirror_points
 
 SCENES = {
     "usual": {"outliers": 0.1, "missing": 0.1},

@@ -19,9 +19,9 @@ from kinefit.images.detectors.box_detector import Models
 from kinefit.images.detectors.detection import detect_people
 from kinefit.images.detectors.faces import HEAD, FaceFinder, FaceModels
 from kinefit.observations import MEDIAPIPE_478, Detections
-from kinefit.preparing import detecting
 from kinefit.readers.calibration.read import read_calibration
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
+from kinefit.takes.preparing import detecting
 
 _GOALS = {
     "faces_found": ("% of frames that two cameras or more find it in", ">= 95"),

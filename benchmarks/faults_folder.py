@@ -21,10 +21,10 @@ import kinefit
 from benchmarks.figures import LEFT_OUT, amount, figure, quick
 from benchmarks.long import command, same_results, tracked, write_long_take
 from kinefit.errors import KinefitError
+from kinefit.fitting.tracking.checkpoints.checkpoint import Checkpoint, key_of
+from kinefit.fitting.tracking.checkpoints.frame_file import FORMAT, FRAME, STATE
 from kinefit.readers.take.file import Take, read_take
 from kinefit.takes.track import track_take
-from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
-from kinefit.tracking.checkpoints.frame_file import FORMAT, FRAME, STATE
 
 LONG, KILLS = 20_000, 20
 _FRAMES, _BYTES = amount(700, 160), 10_000  # frames of the take that is killed; of a frame, about

@@ -13,23 +13,23 @@ import sys
 import threading
 import time
 
-from tests.live.refused import REFUSED
-from tests.serving.asking import GONE, is_let_in, port_of, ws
-from tests.serving.flooding import FLOODS
-from tests.serving.probing import break_off, probe
+from tests.studio.live.refused import REFUSED
+from tests.studio.serving.asking import GONE, is_let_in, port_of, ws
+from tests.studio.serving.flooding import FLOODS
+from tests.studio.serving.probing import break_off, probe
 from websockets.sync.client import connect
 
 from benchmarks.figures import amount, figure
 from benchmarks.live import RATE, Loop
-from kinefit.live.receivers.websocket import WebSockets
-from kinefit.live.session import LiveSession
-from kinefit.motion import UP_AXES
-from kinefit.serving.access import Access
+from kinefit.bodies.motion import UP_AXES
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.simulation.recordings import warm_keypoints
-from kinefit.tracking.tracker import Tracker
-from kinefit.viewers.clicks import ClickPage
-from kinefit.viewers.stage import open_server, quiet
+from kinefit.studio.live.receivers.websocket import WebSockets
+from kinefit.studio.live.session import LiveSession
+from kinefit.studio.serving.access import Access
+from kinefit.studio.viewers.clicks import ClickPage
+from kinefit.studio.viewers.stage import open_server, quiet
 
 PAGE, HOST = {"Origin": "https://evil.example"}, {"host": "evil.example"}
 
@@ -109,7 +109,7 @@ def beside_floods(server, seconds):
     """{kind of flood: packets of a second client beside it, and of the same client just before}."""
     url, counts = ws(server.url), {}
     for kind in FLOODS:
-        words = [sys.executable, "-m", "tests.serving.flooding", str(server.port), server.access.token, kind]
+        words = [sys.executable, "-m", "tests.studio.serving.flooding", str(server.port), server.access.token, kind]
         with connect(url) as client:
             alone = received(client, seconds)
             with subprocess.Popen([*words, str(seconds + 1.0)], stdout=subprocess.PIPE) as flooder:

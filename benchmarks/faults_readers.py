@@ -28,10 +28,10 @@ from benchmarks.fuzz_worker import Seed, answer
 from kinefit.bodies import load_body
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.depth.recordings import read_depth
-from kinefit.readers.detections import read_detections
+from kinefit.readers.landmarks.detections import read_detections
 from kinefit.readers.skeletons.characters import read_character
 from kinefit.sensors.kinds.silhouettes import read_silhouettes
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 path = Path(sys.argv[1])
 print(*answer(Seed((path,), lambda: {code}), path.parent))
 """

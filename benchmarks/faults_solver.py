@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, data, figure
 from kinefit import fit_marker_subject, fit_markers, load_body, read_markers
 from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.calibration.people.floor import centre_of_mass
-from kinefit.losses import SQUARED
-from kinefit.markers.poses import columns, sequence_both_ways
+from kinefit.fitting.markers.poses import columns, sequence_both_ways
+from kinefit.geometry.losses import SQUARED
+from kinefit.rigs.people.floor import centre_of_mass
 from kinefit.sensors.settings import MARKER_LOSS
-from kinefit.solvers.sequence import fit_sequence
+from kinefit.solving.trajectory.sequence import fit_sequence
 
 SETTINGS: dict[str, dict[str, Any]] = {"squared": {"loss": SQUARED}, "robust": {"loss": MARKER_LOSS, "posture": 1.0}}
 """Losses of the simulated take; the second is what `fit_markers` takes."""

@@ -22,9 +22,9 @@ from scipy.io import savemat
 from tests.strangers import ENDINGS, ROADS, code_that_runs, outcome, without_end
 
 from benchmarks.figures import amount, figure
-from kinefit.live.cameras import Inbox, SessionClock
-from kinefit.live.folders import ImageFolderStream
 from kinefit.simulation import write_synthetic_take
+from kinefit.studio.live.cameras import Inbox, SessionClock
+from kinefit.studio.live.folders import ImageFolderStream
 
 _COMMAND_TIMEOUT_S = 120.0  # of a command that takes some 10 s
 _MAX_DELAY_S = 1.0  # of a live image: 0.05 s by design, the rest for a busy computer

@@ -20,7 +20,7 @@ def attacks() -> dict[str, bool]:
         from playwright.sync_api import sync_playwright
     except ImportError as error:
         raise RuntimeError("playwright is not installed") from error
-    from tests.app import attacking
+    from tests.studio.app import attacking
 
     from kinefit.simulation import write_synthetic_take
 

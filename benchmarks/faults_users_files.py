@@ -25,12 +25,12 @@ import kinefit
 from benchmarks.faults_users_pictures import QUIET, write_video
 from benchmarks.faults_users_pictures import run as command
 from benchmarks.figures import amount, data, figure
-from kinefit.diagnostics.depth import depth_findings
 from kinefit.errors import KinefitError
 from kinefit.readers.depth.recordings import read_clouds, read_depth
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
+from kinefit.rigs.diagnostics.depth import depth_findings
 from kinefit.sensors.kinds.silhouettes import read_silhouettes
 
 Answer = Callable[[Path], str]
@@ -355,7 +355,7 @@ def _lsl(_: Path) -> str:
     """Steps 20 ms apart, half a second of them dropped: time stamps and stated rate, as pylsl has them."""
     import pylsl
 
-    from kinefit.live.receivers.websocket import Lsl
+    from kinefit.studio.live.receivers.websocket import Lsl
 
     body, out = kinefit.load_body("humanoid"), Lsl("files", rate=50.0)
     out.hello(body, b"")

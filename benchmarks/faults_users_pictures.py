@@ -22,11 +22,11 @@ from benchmarks.people_real import take_of
 from kinefit.cli import main
 from kinefit.errors import ObservationError
 from kinefit.observations import Keypoints
-from kinefit.readers.detections import detections_file, read_detections
-from kinefit.readers.keypoint_sets import KEYPOINT_SETS
-from kinefit.readers.keypoints import read_keypoints, read_openpose
+from kinefit.readers.landmarks.detections import detections_file, read_detections
+from kinefit.readers.landmarks.keypoint_sets import KEYPOINT_SETS
+from kinefit.readers.landmarks.keypoints import read_keypoints, read_openpose
 from kinefit.readers.take.file import read_take
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 from kinefit.takes.missing import prepared
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")

@@ -23,10 +23,10 @@ from benchmarks.peers.environments import run_peer
 from kinefit import read_motion
 from kinefit.bodies import PointSet
 from kinefit.bodies.marker_sets import placed_set_names, placement
+from kinefit.bodies.motion import Motion
 from kinefit.cli import main
 from kinefit.cli.markers._fit import fit_file
 from kinefit.exporters import write_markers
-from kinefit.motion import Motion
 from kinefit.observations import Markers, SkeletonMotion
 from kinefit.readers.skeletons.acclaim import read_amc
 from kinefit.readers.skeletons.bvh import read_bvh

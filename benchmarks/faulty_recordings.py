@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, data
 from benchmarks.tracking import DETECTORS, TRIAL, take_text
-from kinefit.assets import write_sample_take
 from kinefit.errors import AssetError, ObservationError
+from kinefit.fitting.multiview.followed import follow
 from kinefit.geometry.camera import Rig
-from kinefit.multiview.followed import follow
 from kinefit.observations import MEDIAPIPE_33
+from kinefit.readers.assets import write_sample_take
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations

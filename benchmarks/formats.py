@@ -24,13 +24,13 @@ from benchmarks.figures import LEFT_OUT, figure, peers
 from benchmarks.peers.environments import run_peer
 from benchmarks.retarget import validated
 from kinefit import exporters
+from kinefit.bodies.motion import Motion
 from kinefit.errors import ExportError
 from kinefit.exporters.skeletons.common import bone_names
 from kinefit.geometry import se3
-from kinefit.motion import Motion
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.depth.recordings import read_depth
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 from kinefit.simulation import squat_and_wave
 
 GOAL = "<= 1e-05"

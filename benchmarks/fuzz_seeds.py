@@ -167,7 +167,7 @@ def _colmap(folder: Path) -> Seed:
 
 
 def _openpose(folder: Path) -> Seed:
-    from kinefit.readers.keypoints import read_openpose
+    from kinefit.readers.landmarks.keypoints import read_openpose
 
     (folder / "json").mkdir()
     for i in range(3):
@@ -178,14 +178,14 @@ def _openpose(folder: Path) -> Seed:
 
 
 def _mediapipe(folder: Path) -> Seed:
-    from kinefit.readers.keypoints import read_mediapipe
+    from kinefit.readers.landmarks.keypoints import read_mediapipe
 
     np.save(folder / "a.npy", np.random.default_rng(0).random((4, 33, 3)) * (640, 480, 1))
     return Seed((folder / "a.npy",), lambda: read_mediapipe(folder / "a.npy", camera="a", rate=30.0))
 
 
 def _caliscope(folder: Path) -> Seed:
-    from kinefit.readers.keypoints import read_caliscope_csv
+    from kinefit.readers.landmarks.keypoints import read_caliscope_csv
 
     lines = ["sync_index,port,frame_time,point_id,img_loc_x,img_loc_y"]
     cells = [(i, p, k) for i in range(4) for p in (0, 1) for k in range(0, 33, 4)]
@@ -197,7 +197,7 @@ def _caliscope(folder: Path) -> Seed:
 def _detections(folder: Path) -> Seed:
     from kinefit.exporters.motion_file import write_detections
     from kinefit.observations import Detections
-    from kinefit.readers.detections import detections_key, read_detections
+    from kinefit.readers.landmarks.detections import detections_key, read_detections
 
     points = np.random.default_rng(0).random((3, 2, 33, 2)).astype(np.float32)
     runs, starts = np.tile([5, 10, 33], 6), np.arange(0, 19, 3)
@@ -251,7 +251,7 @@ def _amc(folder: Path) -> Seed:
 
 
 def _static_points(folder: Path) -> Seed:
-    from kinefit.readers.annotations import read_static_points
+    from kinefit.readers.landmarks.annotations import read_static_points
 
     (folder / "points.toml").write_text("[beam]\na = [1.5, 2.0]\nb = [3.0, 4.0]\n[post]\na = [5, 6]\nb = [7, 8]\n")
     return Seed((folder / "points.toml",), lambda: read_static_points(folder / "points.toml", ("a", "b")))
@@ -358,7 +358,7 @@ def _clouds(kind: str) -> Callable[[Path], Seed]:
 
 def _video(codec: str, ending: str) -> Callable[[Path], Seed]:
     def make(folder: Path) -> Seed:
-        from kinefit.readers.video import Video
+        from kinefit.readers.videos.video import Video
 
         path = folder / f"a{ending}"
         with av.open(str(path), "w") as container:
@@ -380,7 +380,7 @@ def _video(codec: str, ending: str) -> Callable[[Path], Seed]:
 
 def _images(ending: str) -> Callable[[Path], Seed]:
     def make(folder: Path) -> Seed:
-        from kinefit.readers.video import Video
+        from kinefit.readers.videos.video import Video
 
         (folder / "cam").mkdir()
         for i in range(3):
@@ -416,7 +416,7 @@ def body_of(name: str) -> Callable[[Path], Seed]:
     def make(folder: Path) -> Seed:
         from kinefit.bodies import load_body
 
-        text = (resources.files("kinefit.bodies") / "catalogue" / f"{name}.toml").read_text("utf-8")
+        text = (resources.files("kinefit.bodies.toml") / "catalogue" / f"{name}.toml").read_text("utf-8")
         (folder / "body.toml").write_text(text)
         return Seed((folder / "body.toml",), lambda: finite(load_body(folder / "body.toml")))
 
@@ -453,8 +453,8 @@ def _marker_set(folder: Path) -> Seed:
 
 def _subject(folder: Path) -> Seed:
     from kinefit.bodies.marker_sets import load_marker_set
-    from kinefit.identification.model.from_frame import model_from_frame
-    from kinefit.identification.model.model import load_model, save_model
+    from kinefit.markers.model.from_frame import model_from_frame
+    from kinefit.markers.model.model import load_model, save_model
 
     markers = load_marker_set("cmu_41")
     save_model(model_from_frame(markers.places, markers.labels, markers), folder / "anna.json")

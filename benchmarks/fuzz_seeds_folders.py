@@ -61,7 +61,7 @@ def packed_glb(tree: dict, binary: bytes) -> bytes:
 
 
 def _clicks(folder: Path) -> Seed:
-    from kinefit.readers.annotations import clicks_text, read_clicks
+    from kinefit.readers.landmarks.annotations import clicks_text, read_clicks
 
     points = {camera: {name: [812.0, 401.5] for name in ("r_knee", "l_knee", "c7")} for camera in ("a", "b")}
     (folder / "clicks.json").write_text(json.dumps({"step": 0, "points": points}))

@@ -165,7 +165,7 @@ def _trackers(folder: Path) -> Seed:
 
 
 def _bar(folder: Path) -> Seed:
-    from kinefit.calibration.bar.table import read_centroids
+    from kinefit.rigs.bar.table import read_centroids
 
     rows = [f"{c},{i},{10 + i}.5,{5 + 8 * k}.25" for c in ("a", "b") for i in range(4) for k in (0, 1)]
     (folder / "bar.csv").write_text("camera,frame,u,v\n" + "\n".join(rows) + "\n")
@@ -278,7 +278,7 @@ def _recording(read: str) -> Callable[[Path], Seed]:
             return [video.frame(i) for video in videos for i in range(min(len(video), 3))]
 
         def video() -> object:
-            from kinefit.readers.video import Video
+            from kinefit.readers.videos.video import Video
 
             with Video(file / "a/color/image_raw") as found:
                 return [found.read(i) for i in range(min(len(found), 3))]

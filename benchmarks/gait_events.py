@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, data, figure
+from kinefit.bodies.motion import Motion
 from kinefit.exporters.report.cycles import find_cycles, gait_numbers
 from kinefit.exporters.report.feet import foot_events
-from kinefit.motion import Motion
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
 from kinefit.readers.motion import read_motion

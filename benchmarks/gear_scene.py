@@ -16,9 +16,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from kinefit.bodies.rendering import Canvas, Raster, scaled
 from kinefit.bodies.surfaces import BodyMesh
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.rendering import Canvas, Raster, scaled
 from kinefit.simulation.figures import look_at
 from kinefit.simulation.rendering.scenes import GRAIN, grain_table
 

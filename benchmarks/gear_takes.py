@@ -20,10 +20,10 @@ from benchmarks.figures import amount
 from benchmarks.gear_scene import GearScene, Light, Thing, clouds
 from benchmarks.gear_things import box, piece
 from kinefit.bodies import load_body
+from kinefit.bodies.motion import Motion
 from kinefit.bodies.toml.bodies import catalogue_text
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Motion
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import movement, simulate_keypoints, studio_rig
 from kinefit.simulation.retarget import known_motion

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from benchmarks.gear_scene import Thing
 from kinefit.bodies import Body
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.motion import Motion
 from kinefit.bodies.surfaces import BodyMesh, TaperedCylinder
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.bodies.surfaces.triangles import triangles
 from kinefit.geometry import se3
-from kinefit.motion import Motion
 from kinefit.simulation.rendering.scenes import grain
 
 Ground = Callable[[NDArray, NDArray], tuple[NDArray, NDArray, NDArray]]

@@ -18,8 +18,8 @@ from kinefit.geometry.lines import triangulate
 from kinefit.images.detectors.box_detector import Models
 from kinefit.images.detectors.detection import detect_people
 from kinefit.images.detectors.faces import HandFollower, HandModels
-from kinefit.preparing import detecting
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
+from kinefit.takes.preparing import detecting
 
 _GOALS = {
     "hands_stereo_found": ("% of images, the worse camera", ">= 90"), "hands_stereo_reprojection": ("px", "<= 3"),

@@ -24,7 +24,7 @@ from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.lines import triangulate_robust
 from kinefit.observations import MEDIAPIPE_33, MEDIAPIPE_75
 from kinefit.readers.calibration.read import read_calibration
-from kinefit.readers.keypoints import read_caliscope_csv
+from kinefit.readers.landmarks.keypoints import read_caliscope_csv
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.takes.missing import prepared

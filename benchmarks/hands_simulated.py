@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from benchmarks.figures import FAILED, amount, figure
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, read_motion, track
 from kinefit.bodies import Body
-from kinefit.evaluation import angle_errors, joint_errors
 from kinefit.geometry import se3
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import simulate_keypoints, studio_rig
+from kinefit.simulation.evaluation import angle_errors, joint_errors
 from kinefit.simulation.retarget import known_motion
-from kinefit.solvers.bundle.shape import mirror_points
+from kinefit.solving.bundle.shape import mirror_points
 
 SET = "MEDIAPIPE_75"
 FINGERS = ("thumb", "index", "middle", "ring", "little")

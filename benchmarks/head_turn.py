@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure
 from benchmarks.hands_simulated import near_rig, somebody, tracked
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, track
-from kinefit.evaluation import angle_errors
 from kinefit.geometry import se3
 from kinefit.sensors.points.lifted import HIPS
 from kinefit.simulation import simulate_keypoints, studio_rig
+from kinefit.simulation.evaluation import angle_errors
 from kinefit.simulation.retarget import known_motion
-from kinefit.solvers.bundle.shape import mirror_points
+from kinefit.solving.bundle.shape import mirror_points
 
 POSE, FACE = "MEDIAPIPE_33", "MEDIAPIPE_478"
 ERRORS = {"noise_px": 2.0, "drift_px": 1.0, "drift_time": 0.3, "outliers": 0.03, "missing": 0.05}

@@ -19,8 +19,8 @@ import numpy as np
 from benchmarks.figures import amount, data, figure
 from kinefit.errors import AssetError, ObservationError
 from kinefit.exporters import write_montage
-from kinefit.preparing.detecting import DetectionJob
-from kinefit.preparing.faces import HiddenVideo, find_faces
+from kinefit.takes.preparing.detecting import DetectionJob
+from kinefit.takes.preparing.faces import HiddenVideo, find_faces
 
 SEED, IMAGES = 2611, 300
 _TABLE = Path(__file__).with_name("hide_faces.csv")
@@ -72,7 +72,7 @@ def _videos() -> dict[str, Path]:
 
 def drawn() -> list[tuple[str, int]]:
     """Video and frame of each image that the seed draws, from every frame of every video alike; sorted."""
-    from kinefit.readers.video import Video
+    from kinefit.readers.videos.video import Video
 
     every = []
     for name, path in _videos().items():

@@ -17,14 +17,14 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.figures import amount, data, figure
-from kinefit.live.cameras import Arrived
-from kinefit.live.receivers.websocket import JsonLines, Vmc, WebSockets
-from kinefit.live.record import MotionRecord
-from kinefit.live.session import LiveSession
-from kinefit.live.take import live_session
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation.recordings import warm_keypoints
+from kinefit.studio.live.cameras import Arrived
+from kinefit.studio.live.receivers.websocket import JsonLines, Vmc, WebSockets
+from kinefit.studio.live.record import MotionRecord
+from kinefit.studio.live.session import LiveSession
+from kinefit.studio.live.take import live_session
 
 TRIAL, RATE = "video_balancing_4cam", 30.0
 _CLIENT = (

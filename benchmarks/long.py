@@ -20,10 +20,10 @@ import numpy as np
 
 from benchmarks.figures import LEFT_OUT, amount, figure, quick
 from kinefit.bodies import load_body
+from kinefit.bodies.motion import Motion
 from kinefit.exporters.report.report import write_report
-from kinefit.motion import Motion
 from kinefit.readers.calibration.read import write_calibration
-from kinefit.readers.keypoint_sets import KEYPOINT_SETS
+from kinefit.readers.landmarks.keypoint_sets import KEYPOINT_SETS
 from kinefit.readers.motion import read_motion
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
-from kinefit.photogrammetry.least_squares_matching import Matches, match
-from kinefit.photogrammetry.spline_image import SplineImage
+from kinefit.images.photogrammetry.least_squares_matching import Matches, match
+from kinefit.images.photogrammetry.spline_image import SplineImage
 
 TILE, GRAIN, CONTRAST, NOISE, SEED = 40, 1.2, 40.0, 0.02 * 255, 20261
 

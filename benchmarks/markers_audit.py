@@ -11,10 +11,10 @@ import numpy as np
 from benchmarks.figures import amount, data, figure
 from benchmarks.marker_takes import put_right
 from kinefit.bodies.marker_sets import find_marker_set
-from kinefit.identification.audit.audit import audit_take
-from kinefit.identification.model.gate import training_gate
-from kinefit.identification.model.learn import learn_model
-from kinefit.identification.model.model import MarkerModel
+from kinefit.markers.audit.audit import audit_take
+from kinefit.markers.model.gate import training_gate
+from kinefit.markers.model.learn import learn_model
+from kinefit.markers.model.model import MarkerModel
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
 

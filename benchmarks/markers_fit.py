@@ -28,10 +28,10 @@ from benchmarks.peers.environments import run_peer
 from kinefit import Markers, Motion, load_body, read_markers
 from kinefit.cli.markers._fit import worn_body
 from kinefit.exporters import write_markers, write_osim
-from kinefit.markers.poses import columns, sequence_both_ways
-from kinefit.markers.subject import MarkerSubject, fit_marker_subject
+from kinefit.fitting.markers.poses import columns, sequence_both_ways
+from kinefit.fitting.markers.subject import MarkerSubject, fit_marker_subject
+from kinefit.fitting.tracking.markers import fit_markers
 from kinefit.readers.c3d_file import read_c3d
-from kinefit.tracking.markers import fit_markers
 
 CHILD = {"hip": "thigh", "knee": "shank", "ankle": "foot", "shoulder": "upperarm", "elbow": "forearm", "wrist": "hand"}
 SAGITTAL = {"hip": "hip_flexion", "knee": "knee_angle", "ankle": "ankle_angle"}
@@ -203,8 +203,8 @@ def two_laboratories(folder: Path) -> Iterator[tuple[str, Markers, Markers, dict
 def known_person() -> None:
     """Simulated people whose markers sit 1 to 6 cm off the set's places: what movement adds to a static trial."""
     from kinefit.bodies.marker_sets import placement
-    from kinefit.evaluation import joint_errors
     from kinefit.simulation import squat_and_wave
+    from kinefit.simulation.evaluation import joint_errors
 
     truth, errors = squat_and_wave(rate=60), []
     placed = placement(truth.body, "CMU_41")

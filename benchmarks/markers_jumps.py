@@ -20,9 +20,9 @@ from benchmarks.motions import library
 from kinefit import Markers, Motion, fit_marker_subject, fit_markers, load_body
 from kinefit.bodies import BodyState
 from kinefit.bodies.marker_sets import placement
-from kinefit.markers.poses import columns
+from kinefit.fitting.markers.poses import columns
 from kinefit.sensors.settings import MARKER_LOSS
-from kinefit.solvers.sequence import fit_sequence
+from kinefit.solving.trajectory.sequence import fit_sequence
 
 DROP_JUMP = "markers/nimblephysics/data__grf__Subject4__MarkerData__DJ1.trc"
 SQUATS = "markers/nimblephysics/data__grf__Subject4__MarkerData__squats1.trc", 680

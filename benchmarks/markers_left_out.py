@@ -22,9 +22,9 @@ from benchmarks.figures import amount, data, figure
 from benchmarks.mixed_figures import SIGMAS
 from kinefit import MarkerFrame, Markers, Recording, load_body, read_markers, track
 from kinefit.bodies import Body
+from kinefit.fitting.markers.subject import MarkerSubject, fit_marker_subject
+from kinefit.fitting.subject.subject import Subject
 from kinefit.geometry.camera import Rig
-from kinefit.markers.subject import MarkerSubject, fit_marker_subject
-from kinefit.subject.subject import Subject
 
 RATE, FRAMES, EVERY = 25.0, amount(50, 12), amount(3, 16)  # [Hz]; of each take, from its middle; markers
 GROUPS = {

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure
 from benchmarks.marker_takes import CASES, HELD, Case, broken, load, shuffled, training
 from kinefit.errors import ObservationError
-from kinefit.identification.frame.identify import identify
-from kinefit.identification.model.learn import learn_model
-from kinefit.identification.model.model import MarkerModel
-from kinefit.identification.take.takes import identify_take
+from kinefit.markers.frame.identify import identify
+from kinefit.markers.model.learn import learn_model
+from kinefit.markers.model.model import MarkerModel
+from kinefit.markers.take.takes import identify_take
 from kinefit.observations import Markers
 
 FRAMES = int(os.environ.get("FRAMES", amount(60, 2)))

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.exporters import write_markers
-from kinefit.identification.frame.identify import identify
-from kinefit.identification.model.model import load_model
+from kinefit.markers.frame.identify import identify
+from kinefit.markers.model.model import load_model
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
 from kinefit.readers.motion import read_motion

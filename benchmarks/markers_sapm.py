@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure
 from benchmarks.marker_takes import STANFORD, load, shuffled
 from kinefit.bodies.marker_sets import find_marker_set
-from kinefit.identification.frame.identify import identify
-from kinefit.identification.model.from_frame import model_from_frame
-from kinefit.identification.model.model import MarkerModel
+from kinefit.markers.frame.identify import identify
+from kinefit.markers.model.from_frame import model_from_frame
+from kinefit.markers.model.model import MarkerModel
 from kinefit.observations import Markers
-from kinefit.recipes.sapm import sapm
+from kinefit.papers.sapm import sapm
 
 TAKES = {
     "walk": "momentum/momentum__examples__process_markers_app__02_01.c3d",

@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.figures import amount, figure
 from benchmarks.marker_takes import broken, load, shuffled
 from kinefit import Markers, fit_marker_subject, fit_markers, identify, identify_take, learn_model, load_body
-from kinefit.identification.model.model import MarkerModel
+from kinefit.markers.model.model import MarkerModel
 
 LARGE = "nimblephysics/data__osim__WeirdFormatTests__markers.trc"
 """61 markers, most of them in clusters."""

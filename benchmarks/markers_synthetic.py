@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure, quick
 from benchmarks.synthetic_points import random_pose, synthetic_body
-from kinefit.identification.frame.identify import identify
-from kinefit.identification.model.model import MarkerModel
-from kinefit.recipes.sapm import sapm
+from kinefit.markers.frame.identify import identify
+from kinefit.markers.model.model import MarkerModel
+from kinefit.papers.sapm import sapm
 
 POSES = int(os.environ.get("POSES", amount(200, 1)))
 CLEAN = int(os.environ.get("CLEAN", amount(2000, 5)))

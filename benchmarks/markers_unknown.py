@@ -22,9 +22,9 @@ from benchmarks.figures import amount, figure
 from benchmarks.marker_takes import HELD, broken, load
 from kinefit import load_body
 from kinefit.errors import ObservationError
-from kinefit.identification.model.learn import learn_model
-from kinefit.identification.take.takes import identify_take
-from kinefit.markers.first_set import first_set
+from kinefit.fitting.markers.first_set import first_set
+from kinefit.markers.model.learn import learn_model
+from kinefit.markers.take.takes import identify_take
 from kinefit.observations import Markers
 
 TAKES = {

@@ -29,20 +29,20 @@ from benchmarks.figures import amount, figure, quick
 from benchmarks.retarget import validated
 from benchmarks.surface_body import OFF, moving_arm
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.body_surfaces import nearest
 from kinefit.bodies.surfaces import Metaballs
 from kinefit.bodies.surfaces.metaballs import LEVEL
+from kinefit.bodies.surfaces.places import nearest
 from kinefit.bodies.surfaces.skins.body_skin import BodySkin, body_skins
 from kinefit.bodies.surfaces.skins.skin_tubes import field
 from kinefit.bodies.surfaces.skins.skinning import subdivided
-from kinefit.correspondences import field_rows, surface_rows
 from kinefit.errors import BodyError
 from kinefit.exporters import write_glb
-from kinefit.losses import huber
-from kinefit.recipes.metaball_bodies import MetaballBody, MetaballHelps, metaball_bodies
+from kinefit.fitting.subject.metaballs import fit_balls, grown, unmeshed
+from kinefit.geometry.losses import huber
+from kinefit.papers.metaball_bodies import MetaballBody, MetaballHelps, metaball_bodies
 from kinefit.simulation import squat_and_wave
-from kinefit.solvers.equations import normal_equations
-from kinefit.subject.metaballs import fit_balls, grown, unmeshed
+from kinefit.solving.correspondences import field_rows, surface_rows
+from kinefit.solving.equations import normal_equations
 
 FRAMES, POINTS, NOISE = 10, 1000, 0.001
 LIMBS = "upperarm", "forearm", "hand"

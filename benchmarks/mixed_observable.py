@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from benchmarks.mixed_takes import CAMERAS, DETECTOR, MARKER_SET, MASK_SCALE, SENSOR, TWENTY, WRISTS_ANKLES
 from kinefit import Motion
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.rendering import scaled
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.rendering import scaled
 from kinefit.simulation import SimulatedScene
 
 EVERY, STEP = 10, 1e-4  # frames; [m], [rad]

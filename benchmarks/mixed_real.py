@@ -19,7 +19,7 @@ from benchmarks.figures import data, figure
 from benchmarks.silhouettes_track import CAMERAS, overlaps
 from kinefit import Keypoints, Motion, Rig, track_take
 from kinefit.errors import KinefitError
-from kinefit.multiview.association import choose_people
+from kinefit.fitting.multiview.association import choose_people
 from kinefit.readers.take.load import Observations
 from kinefit.sensors.channels import mirror_name
 

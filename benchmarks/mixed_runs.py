@@ -29,8 +29,8 @@ from benchmarks.mixed_takes import CAMERAS, MASK_SCALE, Recording, detected, rec
 from benchmarks.smoothing import acceleration_noise, peak_speeds
 from kinefit import Motion, track_take
 from kinefit.bodies import PointSet
-from kinefit.evaluation import angle_errors
 from kinefit.exporters.report.moments import DOUBT_DISTANCE_M, contradicted, end_variances, probably_far
+from kinefit.simulation.evaluation import angle_errors
 
 MIXES: dict[str, tuple[str, ...]] = {
     "cameras": ("keypoints",),

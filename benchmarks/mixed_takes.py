@@ -24,15 +24,15 @@ from numpy.typing import NDArray
 from benchmarks.figures import data
 from benchmarks.motions import MOTIONS
 from kinefit import Motion, load_body, read_amc, read_bvh
-from kinefit.assets import anny_files
 from kinefit.bodies import Body
-from kinefit.bodies.anny import AnnyModel, load_anny
+from kinefit.bodies.morphs.anny import AnnyModel, load_anny
+from kinefit.bodies.rendering import scaled
 from kinefit.exporters.c3d_file import write_markers
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import DepthVideo, Markers
+from kinefit.readers.assets import anny_files
 from kinefit.readers.calibration.read import write_calibration
-from kinefit.rendering import scaled
 from kinefit.simulation import (
     DepthSensor,
     SimulatedScene,
@@ -45,7 +45,7 @@ from kinefit.simulation import (
     studio_rig,
 )
 from kinefit.simulation.rendering.scenes import room
-from kinefit.solvers.bundle.shape import mirror_points
+from kinefit.solving.bundle.shape import mirror_points
 
 RATE, SECONDS, TRAVEL = 30.0, 3.0, 1.5  # [Hz], [s], [m]
 DETECTOR, MARKER_SET, CAMERAS = "MEDIAPIPE_33", "HANIM_45", ("cam01", "cam02", "cam03", "cam04")

@@ -29,14 +29,14 @@ from kinefit import (
     track,
 )
 from kinefit.errors import AssetError, ObservationError
+from kinefit.fitting.subject.keypoints import fit_subject
+from kinefit.fitting.subject.view_bias import SeenFrames, learn_view_bias
+from kinefit.fitting.tracking.sizing import channels_of
 from kinefit.observations import MEDIAPIPE_33
-from kinefit.preparing import detecting
-from kinefit.readers.keypoints import read_caliscope_csv
+from kinefit.readers.landmarks.keypoints import read_caliscope_csv
 from kinefit.sensors.points.views import ViewBias
-from kinefit.subject.keypoints import fit_subject
-from kinefit.subject.view_bias import SeenFrames, learn_view_bias
 from kinefit.takes.missing import prepared
-from kinefit.tracking.sizing import channels_of
+from kinefit.takes.preparing import detecting
 
 _OWN, _TABLE = "x that without, bias found in the take", "x that without, bias of the other two recordings"
 _TAKES = "openpose", "mediapipe", "balancing", "seated", "cropped"

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import load_body
+from kinefit.bodies.motion import Motion
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.motion import Motion
 from kinefit.observations import Keypoints
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.simulation.movements import movement

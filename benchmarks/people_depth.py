@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, data, figure
 from kinefit import Motion, track_take
-from kinefit.motion import BELIEVED
+from kinefit.bodies.motion import BELIEVED
 from kinefit.readers.take.load import Observations
 
 Read = dict[str, tuple[int, int]]  # part of the body: pixel

@@ -19,10 +19,10 @@ from benchmarks.held_out import cameras_left_out, median, persons
 from benchmarks.motions import library
 from benchmarks.tracking import Trial, read_trial
 from kinefit import Keypoints, Motion, load_body
-from kinefit.evaluation import coverage, joint_errors
+from kinefit.fitting.tracking.recording import Recording
+from kinefit.fitting.tracking.video import track
 from kinefit.simulation import cut, simulate_keypoints, studio_rig
-from kinefit.tracking.recording import Recording
-from kinefit.tracking.video import track
+from kinefit.simulation.evaluation import coverage, joint_errors
 
 DETECTORS = ("openpose", "mediapipe")
 SIMULATED = "jump 02_04", "walk 12_01", "wave"

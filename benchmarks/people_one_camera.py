@@ -27,7 +27,7 @@ from benchmarks.figures import data, figure, quick
 from kinefit import Motion, load_body, read_motion
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry import se3
-from kinefit.preparing import detecting
+from kinefit.takes.preparing import detecting
 
 _TRIALS = "STS", "walk_ts"
 _JOINTS = {

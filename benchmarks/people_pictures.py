@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 
 from benchmarks.people_crowds import RATE, SET, _along, _hidden
 from kinefit import load_body
+from kinefit.bodies.motion import Motion
 from kinefit.errors import KinefitError
+from kinefit.fitting.multiview.followed import PersonKeypoints, sentences
+from kinefit.fitting.multiview.people import people_of
+from kinefit.fitting.tracking.recording import Recording
+from kinefit.fitting.tracking.video import track
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.motion import Motion
-from kinefit.multiview.followed import PersonKeypoints, sentences
-from kinefit.multiview.people import people_of
 from kinefit.observations import Keypoints
 from kinefit.simulation import simulate_keypoints
 from kinefit.simulation.movements import movement
 from kinefit.simulation.movements import people as persons
-from kinefit.tracking.recording import Recording
-from kinefit.tracking.video import track
 
 FRAMES, SHOWN, TILE, _WIDE = 100, 34, (384, 320), 5
 GONE, BACK, EARLY, LATE = 33, 67, 20, 80  # frames in which those who leave are away, and two in which they are drawn

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from benchmarks.figures import data, figure, quick
 from kinefit import load_body
 from kinefit.errors import AssetError, ObservationError
-from kinefit.preparing import detecting
+from kinefit.fitting.tracking.recording import Recording
+from kinefit.fitting.tracking.video import track
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import Observations, load_observations
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 from kinefit.takes.in_view import people_in_view
 from kinefit.takes.missing import prepared
+from kinefit.takes.preparing import detecting
 from kinefit.takes.track import track_take
-from kinefit.tracking.recording import Recording
-from kinefit.tracking.video import track
 
 _GOALS = {
     "people_two_tracks": ("people", "== 2"), "people_two_frames": ("% of the frames, the one seen least", ">= 99"),

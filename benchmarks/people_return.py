@@ -15,19 +15,19 @@ from benchmarks.figures import amount, data, figure, quick
 from benchmarks.people_crowds import RATE, SET, _along, _hidden, _together
 from benchmarks.people_real import take_of
 from kinefit.bodies import Body, load_body
+from kinefit.bodies.motion import Motion
 from kinefit.errors import AssetError, ObservationError
+from kinefit.fitting.multiview.likeness import ImageSource, joints_of
+from kinefit.fitting.multiview.people import PersonTrack, people_of
 from kinefit.geometry.camera import ImageFrame, Rig
-from kinefit.motion import Motion
-from kinefit.multiview.likeness import ImageSource, joints_of
-from kinefit.multiview.people import PersonTrack, people_of
 from kinefit.observations import Keypoints
-from kinefit.preparing import detecting
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.readers.take.videos import TakePictures
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.simulation.movements import movement
 from kinefit.takes.missing import prepared
+from kinefit.takes.preparing import detecting
 
 SEEDS = amount(tuple(range(200, 220)), (200,))  # the odds were settled on 100 to 114
 _BEFORE, _AFTER = 2.0, 2.0  # [s] in view before and after

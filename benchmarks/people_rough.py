@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure
 from benchmarks.people_crowds import RATE, Crowd, crowd
 from benchmarks.people_simulated import errors_of, frames_on_one, motion_of, owners_of
-from kinefit.multiview.people import people_of
+from kinefit.fitting.multiview.people import people_of
 
 KINDS = amount(("cross", "hide", "leave", "crowd"), ("leave",))
 SEEDS = amount((50, 51, 52), (51,))  # 21, 22 and 30 to 35 were looked at

@@ -10,10 +10,10 @@ import numpy as np
 from benchmarks.figures import amount, figure, quick
 from benchmarks.people_crowds import KINDS, Crowd, crowd
 from kinefit import Motion, load_body
-from kinefit.multiview.followed import PersonKeypoints, follow
-from kinefit.multiview.people import PersonTrack, people_of
-from kinefit.tracking.recording import Recording
-from kinefit.tracking.video import track
+from kinefit.fitting.multiview.followed import PersonKeypoints, follow
+from kinefit.fitting.multiview.people import PersonTrack, people_of
+from kinefit.fitting.tracking.recording import Recording
+from kinefit.fitting.tracking.video import track
 
 SEEDS = amount(tuple(range(10, 14)), (10,))  # of each kind of scene: twenty sequences; 0 to 3 found two faults
 _LIMBS = ("upperarm", "forearm", "thigh", "shank")

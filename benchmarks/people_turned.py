@@ -21,13 +21,13 @@ from benchmarks.mixed_cameras import errors
 from benchmarks.tracking import read_trial
 from kinefit import Recording, load_body
 from kinefit.errors import AssetError
+from kinefit.fitting.tracking.cameras import contradiction_sentences as contradicting
+from kinefit.fitting.tracking.cameras import sentences as moved
+from kinefit.fitting.tracking.video import track
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.settings import CameraErrors, TrackSettings
 from kinefit.simulation import simulate_keypoints, studio_rig
-from kinefit.tracking.cameras import contradiction_sentences as contradicting
-from kinefit.tracking.cameras import sentences as moved
-from kinefit.tracking.video import track
 
 _GOALS = {
     "joints": ("mm from the fit with the right calibration, the worst", "<= 15"),

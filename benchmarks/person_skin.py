@@ -1,8 +1,8 @@
-"""Make the skin of a person in figures: `python -m benchmarks.person_skin` writes `kinefit/data/person_skin.npz`.
+"""Make the skin of a person in figures, `bodies/rendering/person_skin.npz`: `python -m benchmarks.person_skin`.
 
 The humanoid's limbs get metaballs whose cross-sections follow the widths below, which are round figures of an average
 adult set by hand, no other model's. One seamless skin with weights is meshed over all of them
-(`kinefit.bodies.surfaces.skins.body_skin`). `kinefit.rendering.looks` scales it to a body's own lengths and
+(`kinefit.bodies.surfaces.skins.body_skin`). `kinefit.bodies.rendering.looks` scales it to a body's own lengths and
 widths.
 """
 
@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, load_body
+from kinefit.bodies.rendering.looks import FILE
 from kinefit.bodies.surfaces import Metaballs
 from kinefit.bodies.surfaces.skins.body_skin import body_skins
-from kinefit.rendering.looks import FILE
 
 _OVERLAP = 1.5  # radius of a ball along its limb, over the gap to the next one
 _SEEN = 0.82  # of a ball's radius across the limb, where balls overlap like that

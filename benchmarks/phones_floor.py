@@ -25,9 +25,9 @@ from benchmarks.phones_real import RECORDINGS, _tracked
 from kinefit import Motion, find_cameras, track_take
 from kinefit.errors import KinefitError
 from kinefit.findings import runs_of
+from kinefit.fitting.smoothing.foot_contacts import soles
 from kinefit.geometry import se3
 from kinefit.readers.guess.folder import guess_take
-from kinefit.smoothing.foot_contacts import soles
 
 _SLOW, _LEAST = 0.15, 0.2  # [m/s], [s] of a foot that rests
 _GOALS = {

@@ -18,11 +18,11 @@ from benchmarks.phones_rooms import turns_between
 from kinefit import Motion, find_cameras, track_take
 from kinefit._files import write_text
 from kinefit.errors import KinefitError
-from kinefit.evaluation import angle_errors
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import read_calibration, read_found
 from kinefit.readers.guess.folder import guess_take
+from kinefit.simulation.evaluation import angle_errors
 from kinefit.takes.missing import cameras_file
 
 RECORDINGS = {

@@ -24,14 +24,14 @@ from benchmarks.figures import amount, figure
 from benchmarks.motions import library
 from kinefit import Keypoints, Motion, find_cameras, track_take
 from kinefit.errors import KinefitError
-from kinefit.evaluation import angle_errors
 from kinefit.exporters.motion_file import write_detections
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import Detections
 from kinefit.readers.calibration.read import FoundCameras, read_found, write_calibration
-from kinefit.readers.keypoint_sets import MEDIAPIPE_33
+from kinefit.readers.landmarks.keypoint_sets import MEDIAPIPE_33
 from kinefit.simulation import cut, known_motion, resampled, simulate_keypoints
+from kinefit.simulation.evaluation import angle_errors
 from kinefit.simulation.keypoints import drift
 from kinefit.takes.missing import cameras_file
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import av
 
 from benchmarks.figures import LEFT_OUT, data, figure, quick
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 
 _SECONDS, _RATE = 10.0, 60
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from benchmarks.figures import data, figure, quick
 from kinefit import Motion, track_take
-from kinefit.assets import CAMERAS
 from kinefit.errors import AssetError, ObservationError
-from kinefit.preparing import detecting
+from kinefit.readers.assets import CAMERAS
 from kinefit.readers.guess.folder import guess_take
+from kinefit.takes.preparing import detecting
 
 _GOALS = {"phones_variable_rate": "<= 5", "phones_unequal_rates": "<= 8"}
 _CALIBRATION = "Calib_refined_static.toml"

@@ -18,10 +18,10 @@ from benchmarks.error_bars import ACCURACY, person
 from benchmarks.figures import figure
 from benchmarks.posture_takes import Take, learnt, shown, takes, uncoupled
 from kinefit import Body, Motion, Recording, load_body, track
-from kinefit.evaluation import angle_errors
 from kinefit.geometry import se3
 from kinefit.simulation import simulate_keypoints, studio_rig
-from kinefit.solvers.bundle.shape import mirror_points
+from kinefit.simulation.evaluation import angle_errors
+from kinefit.solving.bundle.shape import mirror_points
 
 SET = "BODY_25B"
 ANGLES = {"hip flexion": ("hip_flexion_r", "hip_flexion_l"), "lumbar extension": ("lumbar_extension",),

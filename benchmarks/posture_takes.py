@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, data
 from benchmarks.motions import MOTIONS, library
 from kinefit import Body, Markers, Motion, load_body, read_markers
-from kinefit.markers.subject import fit_marker_subject
+from kinefit.fitting.markers.subject import fit_marker_subject
+from kinefit.fitting.tracking.markers import fit_markers
 from kinefit.simulation import cut
 from kinefit.simulation.retarget import known_motion
-from kinefit.tracking.markers import fit_markers
 
 _NIMBLE = "markers/nimblephysics/data__"
 _STANFORD = _NIMBLE + "grf__Subject4__MarkerData__%s1.trc"

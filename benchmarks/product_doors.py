@@ -24,11 +24,11 @@ from benchmarks.faults_users_files import named_files, scene, videos, write_dept
 from benchmarks.faults_users_pictures import QUIET, write_video
 from benchmarks.faults_users_pictures import run as command
 from benchmarks.figures import amount, data, figure
-from kinefit.batch import corrections
+from kinefit.bodies.motion import Residuals
 from kinefit.exporters import write_markers
 from kinefit.exporters.report.report import write_report
-from kinefit.motion import Residuals
 from kinefit.observations import Markers
+from kinefit.takes.batch import corrections
 
 Answer = Callable[[Path], str]
 WALK = "markers/momentum/momentum__examples__process_markers_app__02_01.c3d"

@@ -13,17 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet, load_body
-from kinefit.bodies.body_surfaces import body_mesh, sample
+from kinefit.bodies.rendering import render_body
 from kinefit.bodies.surfaces import MeshSurface, Metaballs
+from kinefit.bodies.surfaces.places import body_mesh, sample
 from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.bodies.tree import KinematicTree
-from kinefit.correspondences.contours.rims import RimFinder
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.recipes._colour_densities import COLOURS, DENSITIES, colour_cells
-from kinefit.recipes.metaball_bodies import metaball_bodies
-from kinefit.recipes.regions import pose_from_regions
-from kinefit.rendering import render_body
+from kinefit.papers._colour_densities import COLOURS, DENSITIES, colour_cells
+from kinefit.papers.metaball_bodies import metaball_bodies
+from kinefit.papers.regions import pose_from_regions
+from kinefit.solving.correspondences.contours.rims import RimFinder
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 _SCALE = 3  # of the small image of regions

@@ -16,9 +16,9 @@ import numpy as np
 from benchmarks.depth_scene import longest_search, started, unhidden
 from benchmarks.figures import amount, figure
 from benchmarks.scene_body10 import FOUND, LOST, Run, Scene, folder, load_scene, run_scene
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.images.regions import RegionSettings
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.tracker import Tracker
 
 BOTH, COLOUR, DEPTH = ("depth", "region"), ("region",), ("depth",)
 # Ten meshes that are exact to parts of a millimetre: errors of contours are alike over few pixels only, and small.

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, data, figure
 from benchmarks.regions_scene import away, rigid, state_of
 from kinefit.bodies import Body
+from kinefit.bodies.motion import Motion
 from kinefit.bodies.surfaces.mesh import read_obj
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.motion import Motion
 from kinefit.observations import ColourFrame
 from kinefit.readers.motion import read_motion
-from kinefit.tracking.tracker import Tracker
 
 RATE = 30.0  # [Hz] that the images are taken to have; the recording does not state it
 IMAGES = amount(None, 13)

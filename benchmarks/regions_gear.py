@@ -22,11 +22,11 @@ from benchmarks.closures_takes import Take
 from benchmarks.curves import COLOURS, curves
 from benchmarks.figures import LEFT_OUT, amount, figure, quick
 from benchmarks.gear_takes import GearTake, rendered_cyclist, rendered_snowboarder
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.motion import Motion
+from kinefit.bodies.rendering import Canvas, render_body
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.geometry.camera import Camera
 from kinefit.images.silhouette import BackgroundPlate
-from kinefit.motion import Motion
-from kinefit.rendering import Canvas, render_body
 from kinefit.takes.track import track_take
 
 SEEDS = (11, 12)

@@ -19,17 +19,17 @@ from benchmarks.figures import LEFT_OUT, amount, data, figure, quick
 from benchmarks.silhouettes_track import CAMERAS, overlaps, tracked, trial_text
 from benchmarks.silhouettes_track import take_text as masks_text
 from kinefit.bodies import BodyState
-from kinefit.bodies.body_surfaces import body_mesh
-from kinefit.correspondences.contours.rims import RimFinder
+from kinefit.bodies.motion import UP_AXES, Motion
+from kinefit.bodies.rendering import render_body, scaled
+from kinefit.bodies.surfaces.places import body_mesh
+from kinefit.fitting.multiview.association import choose_people
+from kinefit.fitting.smoothing.foot_contacts import find_contacts
 from kinefit.geometry.camera import Rig
-from kinefit.motion import UP_AXES, Motion
-from kinefit.multiview.association import choose_people
 from kinefit.observations import SilhouetteVideo
+from kinefit.papers.regions import pose_from_regions
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import Observations, load_observations
-from kinefit.recipes.regions import pose_from_regions
-from kinefit.rendering import render_body, scaled
-from kinefit.smoothing.foot_contacts import find_contacts
+from kinefit.solving.correspondences.contours.rims import RimFinder
 
 FRAMES = amount(100, 3)
 TRACKED = amount(CAMERAS, CAMERAS[:2])

@@ -9,8 +9,8 @@ import numpy as np
 
 from benchmarks.figures import amount, figure
 from benchmarks.regions_scene import KINDS, RATE, TOLD, Sequence, away, rendered, state_of
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.observations import ColourFrame
-from kinefit.tracking.tracker import Tracker
 
 SEED = 2
 FRAMES = amount(40, 9)

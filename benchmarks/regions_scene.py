@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from benchmarks.figures import data
 from benchmarks.silhouettes_car import surface as car_surface
 from kinefit.bodies import Body, BodyState, PointSet, load_body
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.rendering import Canvas, lens_of
 from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.bodies.tree import KinematicTree
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.rendering import Canvas, lens_of
 
 SIZE, FOCAL = (640, 512), 650.0
 RATE = 30.0  # [Hz]

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure
 from benchmarks.silhouettes_scene import ring, swaying
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.rendering import render_body
+from kinefit.bodies.surfaces.places import body_mesh
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry.camera import Rig
 from kinefit.observations import ColourFrame
-from kinefit.rendering import render_body
-from kinefit.tracking.tracker import Tracker
 
 FRAMES, WARM, ROUNDS, RATE = amount(30, 10), 5, amount(5, 1), 30.0
 PAINT = {"head": (200, 150, 130), "hand": (200, 150, 130), "forearm": (205, 155, 130), "upperarm": (40, 80, 160),

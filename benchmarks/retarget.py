@@ -16,8 +16,8 @@ from tests.exporters.skeletons.character_file import write_character_glb
 from tests.exporters.skeletons.test_characters import BONES, SIDES, WORDS, play, unit
 
 from benchmarks.figures import amount, data, figure
+from kinefit.bodies.motion import Motion
 from kinefit.exporters import write_character
-from kinefit.motion import Motion
 from kinefit.readers.skeletons.bvh import read_bvh
 from kinefit.simulation import retarget
 

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
-from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.bodies.surfaces import MeshSurface
 from kinefit.bodies.surfaces.mesh import read_obj
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import ColourFrame, DepthFrame

@@ -19,11 +19,11 @@ from benchmarks.figures import LEFT_OUT, amount, figure
 from benchmarks.mixed_runs import MIXES
 from benchmarks.mixed_takes import RATE, Recording, detected, record, take_text, write
 from kinefit import Motion, track_take
-from kinefit.evaluation import angle_errors
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import studio_rig
+from kinefit.simulation.evaluation import angle_errors
 
 FIRST, DRAWS, SURE = 7000, 8, 10.0  # [degrees]
 AGAIN = 100_000  # added to the draw whose noise a second take has

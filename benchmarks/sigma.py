@@ -22,9 +22,9 @@ from benchmarks.mixed_runs import MIXES
 from benchmarks.mixed_takes import record, take_text, write
 from benchmarks.setups import around
 from kinefit import Motion, track_take
-from kinefit.evaluation import angle_errors
 from kinefit.exporters.report.angles import ranges_of
 from kinefit.exporters.tables import split_side
+from kinefit.simulation.evaluation import angle_errors
 
 PARTS = {
     "sigma": "ranges of five joints and bars of all joint centres, from two and four cameras and from markers",

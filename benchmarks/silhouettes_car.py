@@ -12,15 +12,15 @@ import numpy as np
 from benchmarks.figures import amount, figure
 from benchmarks.silhouettes_scene import looking
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.motion import Motion
+from kinefit.bodies.rendering import render_body
 from kinefit.bodies.surfaces.fourier import FourierSurface
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.tree import KinematicTree
+from kinefit.fitting.initialization.from_silhouettes import Level, coarse_to_fine
 from kinefit.geometry.camera import Rig
-from kinefit.initialization.from_silhouettes import Level, coarse_to_fine
-from kinefit.motion import Motion
 from kinefit.observations import SilhouetteFrame
 from kinefit.readers.calibration.read import write_calibration
-from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
 from kinefit.takes.track import track_take
 

@@ -15,9 +15,9 @@ import numpy as np
 from benchmarks.figures import amount, data, figure
 from benchmarks.regions_cat import camera, images, take_of, truth
 from benchmarks.regions_scene import away
-from kinefit.bodies.body_surfaces import body_mesh
-from kinefit.motion import Motion
-from kinefit.rendering import render_body
+from kinefit.bodies.motion import Motion
+from kinefit.bodies.rendering import render_body
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.takes.track import track_take
 
 COLOUR = 'format = "threshold"\nchannels = "hsv"\nlow = [14, 115, 50]\nhigh = [34, 255, 255]\nsigma = 2.0\n'

@@ -22,8 +22,8 @@ from kinefit.errors import ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.silhouette import outline
+from kinefit.papers.contours import By, pose_of_contour
 from kinefit.readers.calibration.read import read_calibration, write_calibration
-from kinefit.recipes.contours import By, pose_of_contour
 from kinefit.takes.track import track_take
 
 GRID, EDGE = (9, 6), 0.025  # corners; [m] of a square

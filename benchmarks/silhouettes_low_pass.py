@@ -19,8 +19,8 @@ from benchmarks.regions_scene import away
 from benchmarks.silhouettes_cat import take_by_silhouettes
 from benchmarks.silhouettes_contour import off_by
 from benchmarks.silhouettes_track import FRAMES, take_text, tracked
+from kinefit.bodies.motion import Motion
 from kinefit.bodies.serial import save_body
-from kinefit.motion import Motion
 from kinefit.takes.track import track_take
 
 TOY_OFF, PERSON_OFF = amount((20.0, 35.0, 50.0), (35.0,)), amount((20.0, 30.0), (20.0,))  # [deg]

@@ -17,15 +17,15 @@ from benchmarks.curves import COLOURS, curves
 from benchmarks.figures import amount, figure
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.morphs.morphing import JointMotion, LocalMorph, Morphing
-from kinefit.correspondences.contours.morphed import morphed_outline_rows
-from kinefit.correspondences.contours.outlines import outline_pairs
-from kinefit.correspondences.contours.rims import RimFinder
+from kinefit.bodies.rendering import Canvas
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
+from kinefit.geometry.losses import geman_mcclure
 from kinefit.images.silhouette import outline
-from kinefit.losses import geman_mcclure
-from kinefit.rendering import Canvas
-from kinefit.solvers.least_squares import gauss_newton
+from kinefit.solving.correspondences.contours.morphed import morphed_outline_rows
+from kinefit.solving.correspondences.contours.outlines import outline_pairs
+from kinefit.solving.correspondences.contours.rims import RimFinder
+from kinefit.solving.least_squares import gauss_newton
 
 FRAMES, SIZE, FOCAL = 200, (640, 480), 560.0
 JOINTS = tuple(f"{name}_{side}" for side in "rl" for name in ("arm_flex", "arm_add", "elbow_flex"))

@@ -17,9 +17,9 @@ from benchmarks.silhouettes_morphing import FRAMES, JOINTS, cameras, sequence
 from benchmarks.silhouettes_shoulders import stiff
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.bodies.rendering import Canvas
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.readers.calibration.read import write_calibration
-from kinefit.rendering import Canvas
 from kinefit.takes.track import track_take
 
 SEEN = amount(FRAMES, 4)

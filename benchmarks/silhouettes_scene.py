@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.triangles import triangles
+from kinefit.fitting.subject.fit import fit_subject
+from kinefit.fitting.subject.parameters import Parameters
+from kinefit.fitting.subject.subject import SubjectFit
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import SilhouetteFrame
 from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.subject.fit import fit_subject
-from kinefit.subject.parameters import Parameters
-from kinefit.subject.subject import SubjectFit
 
 
 def ring(count: int, *, size: tuple[int, int] = (640, 480), focal: float = 525.0, away: float = 3.0) -> Rig:

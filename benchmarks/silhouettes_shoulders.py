@@ -22,12 +22,12 @@ from benchmarks.figures import amount, data, figure, quick
 from benchmarks.silhouettes_track import CAMERAS, take_text
 from kinefit.bodies import BodyState
 from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.bodies.motion import Motion
+from kinefit.bodies.rendering import Canvas, scaled
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Motion
 from kinefit.observations import SilhouetteVideo
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.rendering import Canvas, scaled
 from kinefit.takes.track import track_take
 
 SCALE = 0.5  # at which the body and masks are compared
@@ -59,7 +59,7 @@ def tracked(text: str, body: str) -> Motion:
 
 def stiff(name: str = "humanoid_morphing") -> str:
     """The catalogue's body without its morphs, as the text of a body file."""
-    text = (files("kinefit.bodies") / "catalogue" / f"{name}.toml").read_text()
+    text = (files("kinefit.bodies.toml") / "catalogue" / f"{name}.toml").read_text()
     return text[: text.index("[[morph]]")]
 
 

@@ -25,16 +25,16 @@ from benchmarks.figures import amount, data, figure
 from benchmarks.silhouettes_scene import of_meshes, ring, swaying
 from benchmarks.silhouettes_track import take_text
 from kinefit.bodies import Body, load_body
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.rendering import Canvas, lens_of, render_body
+from kinefit.bodies.surfaces.places import body_mesh
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry.camera import Rig
 from kinefit.images.silhouette import colour_mask
 from kinefit.observations import SilhouetteFrame
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.rendering import Canvas, lens_of, render_body
 from kinefit.sensors.settings import TrackSettings
 from kinefit.takes.track import track_take
-from kinefit.tracking.tracker import Tracker
 
 FRAMES, WARM, ROUNDS = amount(45, 15), 5, amount(6, 1)
 RED, GREEN = (200, 60, 50), (30, 90, 40)

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
 from benchmarks.silhouettes_anny import shaded
-from kinefit.assets import anny_files
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.anny import AnnyModel, load_anny
+from kinefit.bodies.morphs.anny import AnnyModel, load_anny
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.morphs.operators import GlobalMorph, LocalMorph, Steering
 from kinefit.errors import AssetError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
+from kinefit.readers.assets import anny_files
 
 TORSO = ("pelvis", "lumbar", "abdomen", "torso", "thorax", "clavicle_l", "clavicle_r")
 STEERED = "pro_sup_l"  # an angle that moves no node of a torso

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import LEFT_OUT, amount, data, figure, quick
 from kinefit.bodies import BodyState
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.motion import Motion
+from kinefit.bodies.rendering import render_body, scaled
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Motion
 from kinefit.observations import SilhouetteVideo
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.rendering import render_body, scaled
 from kinefit.takes.track import track_take
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")

@@ -24,12 +24,12 @@ from benchmarks.motions import library
 from benchmarks.tracking import NOISE, TRIAL, median_residual, read_trial
 from kinefit import Motion, Recording, load_body, read_markers, track
 from kinefit.bodies import PointSet
-from kinefit.evaluation import angle_errors, joint_errors
-from kinefit.losses import geman_mcclure
+from kinefit.geometry.losses import geman_mcclure
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
-from kinefit.solvers.trajectory.motion_prior import MotionPrior
-from kinefit.solvers.trajectory.seen_points import SeenPoints
-from kinefit.solvers.trajectory.smoothing import smooth
+from kinefit.simulation.evaluation import angle_errors, joint_errors
+from kinefit.solving.trajectory.motion_prior import MotionPrior
+from kinefit.solving.trajectory.seen_points import SeenPoints
+from kinefit.solving.trajectory.smoothing import smooth
 
 JOINTS = {"Hip": "thigh", "Knee": "shank", "Ankle": "foot", "Shoulder": "upperarm", "Elbow": "forearm", "Wrist": "hand"}
 RIVAL = "rival_results/pose2sim_0.10.49_openpose_refined.trc"

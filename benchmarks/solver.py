@@ -20,11 +20,11 @@ from benchmarks.peers import EXCESS, write_problem
 from benchmarks.peers.environments import run_peer
 from kinefit import Motion, levenberg_marquardt, load_body
 from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.correspondences import point_rows
-from kinefit.initialization.from_points import aligned_root
-from kinefit.losses import geman_mcclure
-from kinefit.rows import Rows
-from kinefit.solvers.sequence import Planes, SequenceFit, fit_sequence
+from kinefit.fitting.initialization.from_points import aligned_root
+from kinefit.geometry.losses import geman_mcclure
+from kinefit.solving.correspondences import point_rows
+from kinefit.solving.rows import Rows
+from kinefit.solving.trajectory.sequence import Planes, SequenceFit, fit_sequence
 
 FRAMES, NOISE, PLANES, PLANE_FRAMES = amount(500, 60), 0.002, 5000, amount(100, 10)
 MOTION = "wash 02_10"

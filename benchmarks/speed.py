@@ -19,11 +19,11 @@ from benchmarks.figures import amount, figure
 from benchmarks.regions_speed import pictures
 from benchmarks.silhouettes_scene import ring, swaying
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.rendering import render_body
+from kinefit.bodies.surfaces.places import body_mesh
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import ColourFrame, DepthFrame, KeypointFrame, MarkerFrame, SilhouetteFrame
-from kinefit.rendering import render_body
-from kinefit.tracking.tracker import Tracker
 
 FRAMES, WARM, ROUNDS, RATE = amount(40, 6), amount(5, 2), amount(4, 1), 30.0
 CAMERAS = amount((1, 2, 4, 8), (1, 2))

@@ -18,7 +18,7 @@ from benchmarks.figures import LEFT_OUT, amount, data, figure, quick
 _TAKE = """
 import sys
 from pathlib import Path
-from kinefit import assets
+from kinefit.readers import assets
 assets.sample_recording = lambda progress=None: Path(sys.argv[1])
 take = assets.write_sample_take(Path(sys.argv[2]))
 if len(sys.argv) > 3:

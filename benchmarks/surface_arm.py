@@ -25,13 +25,13 @@ from kinefit.errors import KinefitError
 from kinefit.exporters.surface_files import write_field_picture
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.photogrammetry.region_growing import Grid
-from kinefit.photogrammetry.spline_image import SplineImage
-from kinefit.photogrammetry.states import measure_states, surface_strain
-from kinefit.photogrammetry.surface import measure
-from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
-from kinefit.photogrammetry.trajectories import Trajectories, uniform, within_bounds
-from kinefit.readers.video import Video
+from kinefit.images.photogrammetry.region_growing import Grid
+from kinefit.images.photogrammetry.spline_image import SplineImage
+from kinefit.images.photogrammetry.states import measure_states, surface_strain
+from kinefit.images.photogrammetry.surface import measure
+from kinefit.images.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
+from kinefit.images.photogrammetry.trajectories import Trajectories, uniform, within_bounds
+from kinefit.readers.videos.video import Video
 
 RADIUS, SIZE, SEED = 0.045, (400, 300), 4242
 FALSE = 0.002  # [m]

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure
 from benchmarks.textured import textured_picture
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.motion import Motion
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.motion import Motion
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.motion import read_motion
 from kinefit.simulation.rendering.scenes import SimulatedScene

@@ -19,10 +19,10 @@ from click.testing import CliRunner
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, data, figure
-from kinefit.photogrammetry.least_squares_matching import match
-from kinefit.photogrammetry.matching.multi_image import search_box
-from kinefit.photogrammetry.spline_image import SplineImage
-from kinefit.readers.video import Video
+from kinefit.images.photogrammetry.least_squares_matching import match
+from kinefit.images.photogrammetry.matching.multi_image import search_box
+from kinefit.images.photogrammetry.spline_image import SplineImage
+from kinefit.readers.videos.video import Video
 
 IMAGES, STEP, WINDOW, REACH = 10, 8, 21, 12  # followed images; [px]
 LEAST, BACK = 0.8, 1.0  # correlation; [px] from where a place began

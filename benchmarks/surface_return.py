@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
 from benchmarks.surface_body import cameras, frames_of, moving_arm, record
-from kinefit.bodies.body_surfaces import nearest
+from kinefit.bodies.motion import Motion
+from kinefit.bodies.surfaces.places import nearest
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Motion
 
 AGAIN, STEEP, FALSE = 3, np.cos(np.radians(65.0)), 0.002
 FACING = 0.25  # cosine as of `photogrammetry.returning`

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.marker_sets import MarkerSet, SetSegment
 from kinefit.geometry.se3 import exp_so3
-from kinefit.identification.model.from_frame import model_from_frame
-from kinefit.identification.model.model import MarkerModel
+from kinefit.markers.model.from_frame import model_from_frame
+from kinefit.markers.model.model import MarkerModel
 
 PLACES = {  # [m] right side and middle; x forward, y up, z right, from the middle of the hips
     "neck": (0.00, 0.54, 0.00), "chest": (0.11, 0.40, 0.03), "back": (-0.10, 0.33, -0.04), "waist": (0.00, 0.12, 0.00),

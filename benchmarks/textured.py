@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
+from kinefit.bodies.rendering import scaled
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
-from kinefit.rendering import scaled
 from kinefit.simulation.rendering.scenes import SimulatedScene
 
 _LATTICE_CELLS = 64  # of the texture, after which it repeats

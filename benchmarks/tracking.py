@@ -20,9 +20,9 @@ from benchmarks.figures import LEFT_OUT, amount, data, figure, quick
 from benchmarks.held_out import sides_right
 from benchmarks.motions import library
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, load_observations, read_take, track
-from kinefit.evaluation import angle_errors, coverage, joint_errors
 from kinefit.geometry.lines import triangulate_robust
 from kinefit.simulation import simulate_keypoints, studio_rig
+from kinefit.simulation.evaluation import angle_errors, coverage, joint_errors
 
 TRIAL = "video_balancing_4cam"
 DETECTORS = ("openpose", "mediapipe")

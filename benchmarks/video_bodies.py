@@ -27,17 +27,17 @@ from benchmarks.bar_scene import draw_bar, wave_bar
 from benchmarks.figures import amount, figure
 from benchmarks.surface_body import frames_of, moving_arm
 from benchmarks.textured import textured_picture
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.motion import Motion
+from kinefit.bodies.surfaces.places import body_mesh
+from kinefit.fitting.initialization.from_clicks import clickable
+from kinefit.fitting.subject.parameters import World
+from kinefit.fitting.subject.surfaces import CylinderShape
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.initialization.from_clicks import clickable
-from kinefit.motion import Motion
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.motion import read_motion
 from kinefit.simulation import squat_and_wave
 from kinefit.simulation.rendering.scenes import SimulatedScene
-from kinefit.subject.parameters import World
-from kinefit.subject.surfaces import CylinderShape
 
 CLICKS = 2.0  # [px]
 LOOKS = 3  # frames that are clicked where joints are clicked again: the first, and two more a third of the take later

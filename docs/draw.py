@@ -59,7 +59,7 @@ BENCHMARKS = {
 }
 """{image: the command that draws it}."""
 
-BY_HAND = ("how_it_works.svg",)
+BY_HAND = ("how_it_works.svg", "rooms.svg")
 """Diagrams that are written as text: the file is its own source."""
 
 

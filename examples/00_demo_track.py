@@ -14,7 +14,7 @@ COORDINATES = ("hip_flexion_r", "knee_angle_r", "hip_flexion_l", "knee_angle_l",
 
 
 def main(take_file=None, out="kinefit-example"):
-    motion, _ = kinefit.track_take(take_file or kinefit.assets.write_sample_take(f"{out}/take"))
+    motion, _ = kinefit.track_take(take_file or kinefit.readers.assets.write_sample_take(f"{out}/take"))
 
     print(f"{motion.name}: {len(motion)} frames at {motion.rate:g} Hz, quality {motion.quality.mean():.2f}")
     for camera, residuals in motion.residuals.items():

@@ -57,8 +57,8 @@ def main(seed=0, noise=0.002):
 
     def make_rows(state):  # called at every state that is tried
         return (
-            kinefit.correspondences.point_rows(lamp, state, lamp.landmarks, measured, sigma=noise),
-            kinefit.correspondences.prior_rows(lamp, state),  # a weak prior for what nothing observes
+            kinefit.solving.correspondences.point_rows(lamp, state, lamp.landmarks, measured, sigma=noise),
+            kinefit.solving.correspondences.prior_rows(lamp, state),  # a weak prior for what nothing observes
         )
 
     fit = kinefit.levenberg_marquardt(lamp, lamp.rest_state(), make_rows)

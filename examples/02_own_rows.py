@@ -44,8 +44,8 @@ def main(seed=0, noise_px=1.0):
     for name, with_rope in (("camera alone", False), ("camera and rope", True)):
 
         def make_rows(state, with_rope=with_rope):
-            pixels = kinefit.correspondences.pixel_rows(arm, state, seen, rig, camera, uv, sigma=noise_px)
-            rows = [pixels, kinefit.correspondences.prior_rows(arm, state)]
+            pixels = kinefit.solving.correspondences.pixel_rows(arm, state, seen, rig, camera, uv, sigma=noise_px)
+            rows = [pixels, kinefit.solving.correspondences.prior_rows(arm, state)]
             return rows + [sphere_rows(arm, state, grip, anchor, length)] * with_rope
 
         fit = kinefit.levenberg_marquardt(arm, arm.rest_state(shoulder), make_rows)

@@ -9,7 +9,8 @@ import sys
 import numpy as np
 
 import kinefit
-from kinefit import evaluation, simulation
+from kinefit import simulation
+from kinefit.simulation import evaluation
 
 
 def main(bvh=None, frames=60, noise_px=3.0):

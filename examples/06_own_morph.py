@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 import kinefit
-from kinefit import correspondences
+from kinefit.bodies import rendering
+from kinefit.solving import correspondences
 
 ARM = """
 [body]
@@ -67,7 +68,8 @@ def drawn(model, state):
     """An image (H, W, 3) of a body from its right side, darker where it is further away."""
     T = np.array([[1.0, 0, 0, -0.15], [0, -1, 0, -0.2], [0, 0, -1, 1.2], [0, 0, 0, 1]])
     camera = kinefit.Camera("side", (480, 480), [[700, 0, 240], [0, 700, 240], [0, 0, 1]], (), "radtan", T)
-    depth = kinefit.rendering.Canvas(camera.size).draw_for(camera, model.pose(state).vertices, model.mesh.faces).depth
+    canvas = rendering.Canvas(camera.size)
+    depth = canvas.draw_for(camera, model.pose(state).vertices, model.mesh.faces).depth
     grey = np.where(np.isfinite(depth), 220 - 1500 * (np.minimum(depth, 9) - 1.12), 255).clip(0, 255)
     return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
 

@@ -47,7 +47,7 @@ def simulated(arm, rig, frames, noise_px, random):
         scene = kinefit.Scene(arm, kinefit.BodyState(SHOULDER, mean), rig, values={"rope": {"length": LENGTH}})
 
         def rows(state, scene=scene, mean=mean):
-            prior = kinefit.correspondences.prior_rows(arm, state, mean=mean, sigma=9)
+            prior = kinefit.solving.correspondences.prior_rows(arm, state, mean=mean, sigma=9)
             return [Pull(0, False).rows(scene.at(state)), prior]
 
         state = kinefit.levenberg_marquardt(arm, scene.state, rows).state

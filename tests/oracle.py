@@ -6,7 +6,7 @@ from scipy.linalg import expm
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.rows import DofRows, PairRows, ParameterRows
+from kinefit.solving.rows import DofRows, PairRows, ParameterRows
 
 STATES = ("random", "identity", "near identity", "near pi")
 

@@ -22,13 +22,13 @@ ROADS = {
     "a job of the window": """
 import asyncio
 from pathlib import Path
-from kinefit.app.jobs import Job
+from kinefit.studio.app.jobs import Job
 job = Job(Path("take.toml"), ("check", "take.toml"))
 asyncio.run(job.run())
 assert job.error and "kinefit itself" not in job.error["problem"], job
 """,
     "a worker of a batch": """
-from kinefit.batch.processes import run_here
+from kinefit.takes.batch.processes import run_here
 assert dict(run_here(len, ["four"], workers=1, retries=0)) == {0: 4}
 """,
     "a process of a live session": """
@@ -39,13 +39,13 @@ with Pool(1) as pool:
     "pip": """
 import subprocess
 from kinefit._processes import environment
-from kinefit.assets import clients
+from kinefit.readers.assets import clients
 assert "pip " in subprocess.run([*clients.pip(), "--version"], env=environment(), capture_output=True, text=True).stdout
 """,
     "npm": """
 import os
 from pathlib import Path
-from kinefit.assets import clients
+from kinefit.readers.assets import clients
 os.environ["PATH"] = "." + os.pathsep + os.environ["PATH"]
 Path("partial/tmp").mkdir(parents=True)
 clients._run([clients.program("npm") or "true", "--version"], Path("partial/tmp"), start=Path("partial/tmp"))
@@ -94,21 +94,21 @@ ENDINGS = {
     "kinefit.readers.calibration.read:read_calibration": ("a.toml", "a.json", "a.yml", "a.xml", "a.mat", "a.xcp"),
     "kinefit.readers.take.file:read_take": ("take.toml",),
     "kinefit.sensors.kinds.surface_points:read_surface_points": ("a.csv", "a.npz"),
-    "kinefit.readers.annotations:read_clicks": ("a.json",),
-    "kinefit.readers.keypoints:read_caliscope_csv": ("a.csv",),
+    "kinefit.readers.landmarks.annotations:read_clicks": ("a.json",),
+    "kinefit.readers.landmarks.keypoints:read_caliscope_csv": ("a.csv",),
     "kinefit.sensors.kinds.trackers:read_body_trackers": ("a.csv",),
-    "kinefit.readers.annotations:read_static_points": ("a.toml",),
+    "kinefit.readers.landmarks.annotations:read_static_points": ("a.toml",),
     "kinefit.sensors.kinds.lines:read_lines": ("a.csv", "a.json"),
-    "kinefit.readers.detections:read_detections": ("a.npz",),
+    "kinefit.readers.landmarks.detections:read_detections": ("a.npz",),
     "kinefit.readers.motion:read_motion": ("a.npz",),
     "kinefit.readers.depth.recordings:read_depth": ("a.mcap", "a.png", "a.tiff", "a.raw", "a.npz", "a.bag"),
     "kinefit.readers.depth.clouds:read_cloud": ("a.ply", "a.pcd"),
-    "kinefit.readers.video_files:first_image": ("a.mp4",),
+    "kinefit.readers.videos.video_files:first_image": ("a.mp4",),
     "kinefit._pictures:read_picture": ("a.png", "a.jpg"),
     "kinefit.bodies:load_body": ("a.toml",),
     "kinefit.bodies.marker_sets.sets:find_record": ("a.toml",),
     "kinefit.bodies.surfaces.mesh:read_obj": ("a.obj",),
-    "kinefit.identification.model.model:load_model": ("a.json",),
+    "kinefit.markers.model.model:load_model": ("a.json",),
 }
 """{module:function that reads a path: names of files that it reads}."""
 

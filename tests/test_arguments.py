@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike
 import kinefit
 from kinefit._arguments import checked
 from kinefit.bodies import load_body
+from kinefit.bodies.motion import UP_AXES
 from kinefit.errors import KinefitError, ObservationError
+from kinefit.fitting.tracking.recording import Recording
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry.camera import Rig
-from kinefit.motion import UP_AXES
 from kinefit.observations import KEYPOINT_SIGMA
 from kinefit.readers.take.entries import KeypointsEntry
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.recording import Recording
-from kinefit.tracking.tracker import Tracker
 
 WRONG = {
     "None": None, "text": "text", "bytes": b"bytes", "whole": 3, "number": 2.5, "nan": float("nan"), "list": [],

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kinefit import assets
-from kinefit.assets import clients
 from kinefit.errors import AssetError, FileError
 from kinefit.geometry.lines import triangulate
+from kinefit.readers import assets
+from kinefit.readers.assets import clients
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 

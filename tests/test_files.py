@@ -17,7 +17,7 @@ from tests.strangers import ENDINGS, outcome, without_end
 from kinefit import exporters
 from kinefit._files import npy_header, parse_toml, read_npy, read_npz, regular, stature_of, write_text, writing
 from kinefit.errors import BodyError, ExportError, FileError, ObservationError
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 
 
 @pytest.mark.parametrize(

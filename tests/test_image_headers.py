@@ -15,11 +15,11 @@ from kinefit._image_headers import MAX_IMAGE_PIXELS, image_sizes
 from kinefit._pictures import read_picture
 from kinefit.errors import CalibrationError, FileError
 from kinefit.geometry.camera import Camera
-from kinefit.live.cameras import SessionClock
-from kinefit.live.folders import ImageFolderStream
 from kinefit.readers.depth.recordings import read_depth
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 from kinefit.sensors.kinds.silhouettes import read_silhouettes
+from kinefit.studio.live.cameras import SessionClock
+from kinefit.studio.live.folders import ImageFolderStream
 
 PICTURE = np.random.default_rng(0).integers(0, 255, (19, 37, 3), np.uint8)
 KINDS = [

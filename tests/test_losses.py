@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from kinefit.losses import SQUARED, Loss, geman_mcclure, huber, tukey
-from kinefit.losses import _kernels as kernels
+from kinefit.geometry.losses import SQUARED, Loss, geman_mcclure, huber, tukey
+from kinefit.geometry.losses import _kernels as kernels
 
 S = np.array([0.0, 0.3, 1.0, 1.9, 2.1, 4.0, 30.0])  # none on a seam
 

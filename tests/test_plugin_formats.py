@@ -14,23 +14,23 @@ from tests.conftest import ROOT
 from tests.docs.blocks import blocks
 from tests.test_plugins import Site
 
-from kinefit.batch.one import Choices, TakeJob, asked_take, work
-from kinefit.batch.results import FORMATS, MotionFormat, check_formats, write_format
 from kinefit.cli import main
 from kinefit.errors import CalibrationError, ExportError, ObservationError, PluginError, TakeError
 from kinefit.exporters import write_motion, write_trc
+from kinefit.fitting.tracking.checkpoints.checkpoint import key_of
 from kinefit.geometry.camera import ImageFrame
 from kinefit.readers import plugins
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.guess.folder import guess_take
-from kinefit.readers.keypoint_sets import KEYPOINT_SETS
-from kinefit.readers.keypoints import read_keypoints
+from kinefit.readers.landmarks.keypoint_sets import KEYPOINT_SETS
+from kinefit.readers.landmarks.keypoints import read_keypoints
 from kinefit.readers.markers import read_markers
 from kinefit.readers.motion import read_motion
 from kinefit.readers.plugins import KEYPOINTS, MARKERS, FileFormat
 from kinefit.readers.take.file import read_take
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave
-from kinefit.tracking.checkpoints.checkpoint import key_of
+from kinefit.takes.batch.one import Choices, TakeJob, asked_take, work
+from kinefit.takes.batch.results import FORMATS, MotionFormat, check_formats, write_format
 
 MODULE = next(block.text for block in blocks("own-sensor", "python") if "MotionFormat(" in block.text)
 PROJECT = next(block.text for block in blocks("own-sensor", "toml") if "kinefit.exporters" in block.text)

@@ -13,9 +13,9 @@ import pytest
 from tests.conftest import ROOT
 from tests.docs.blocks import blocks
 
-from kinefit.batch.many import track_takes
-from kinefit.batch.one import Choices
 from kinefit.errors import FileError, ObservationError, PluginError, TakeError
+from kinefit.fitting.tracking import run as running
+from kinefit.fitting.tracking.checkpoints.checkpoint import Checkpoint, key_of
 from kinefit.readers import plugins
 from kinefit.readers.guess.folder import guess_take
 from kinefit.readers.motion import read_motion
@@ -23,10 +23,10 @@ from kinefit.readers.take import kinds
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave
+from kinefit.takes.batch.many import track_takes
+from kinefit.takes.batch.one import Choices
 from kinefit.takes.check import check_take
 from kinefit.takes.track import track_take
-from kinefit.tracking import run as running
-from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
 
 MODULE = next(block.text for block in blocks("own-sensor", "python") if "KIND = SensorKind" in block.text)
 PROJECT = next(block.text for block in blocks("own-sensor", "toml") if "[project]" in block.text)

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kinefit.bodies import load_body
+from kinefit.bodies.rendering import Canvas, in_camera, rasterise, render_body, scaled, subdivided
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
-from kinefit.rendering import Canvas, in_camera, rasterise, render_body, scaled, subdivided
 
 NEAR = 0.05
 LENS = (60.0, 55.0, 15.3, 11.7)

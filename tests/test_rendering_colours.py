@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
+from kinefit.bodies.rendering import looks
+from kinefit.bodies.rendering.looks import body_mesh
 from kinefit.exporters.report.figure import live_figure
 from kinefit.exporters.report.page import CENTRE_COLOUR, LEFT_COLOUR, RIGHT_COLOUR
-from kinefit.rendering import looks
-from kinefit.rendering.looks import body_mesh
 
 # Machado, Oliveira and Fernandes, IEEE TVCG 15 (2009), severity 1: of linear RGB.
 DEFICIENCIES = {

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
-from kinefit.rendering import looks
-from kinefit.rendering.looks import body_mesh
+from kinefit.bodies.rendering import looks
+from kinefit.bodies.rendering.looks import body_mesh
 
 
 def volume(mesh):

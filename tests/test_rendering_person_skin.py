@@ -7,8 +7,8 @@ import pytest
 from benchmarks.person_skin import skin
 
 from kinefit.bodies import load_body
+from kinefit.bodies.rendering.looks import FILE, body_mesh, person_skin
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
-from kinefit.rendering.looks import FILE, body_mesh, person_skin
 
 BODY = load_body("humanoid")
 

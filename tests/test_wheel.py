@@ -33,7 +33,7 @@ def test_it_holds_every_file_of_the_package(wheel):
     }  # fmt: skip
     assert wanted <= there
     assert Path("kinefit/py.typed") in there  # so that type checkers read the annotations
-    catalogue = {path.name for path in (PACKAGE / "bodies" / "catalogue").glob("*.toml")}
+    catalogue = {path.name for path in (PACKAGE / "bodies" / "toml" / "catalogue").glob("*.toml")}
     assert catalogue and catalogue <= {path.name for path in there if path.parent.name == "catalogue"}
 
 

@@ -14,12 +14,12 @@ import kinefit
 from drawing import results
 from kinefit import Motion, read_motion
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.rendering import Canvas
+from kinefit.bodies.rendering.looks import body_mesh, side_colour
 from kinefit.exporters import write_motion
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
-from kinefit.readers.video import Video
-from kinefit.rendering import Canvas
-from kinefit.rendering.looks import body_mesh, side_colour
+from kinefit.readers.videos.video import Video
 
 PAPER = (247, 249, 251)
 _HEIGHT, _STEP, _SPEED = 360, 4, 80  # [px], every which frame, [ms] each is shown

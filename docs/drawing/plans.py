@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from drawing import results
 from kinefit import read_motion
+from kinefit.bodies.rendering.looks import side_colour, to_hex
 from kinefit.exporters import write_markers
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
-from kinefit.rendering.looks import side_colour, to_hex
 
 _TAKE = "mocaprecovery/data__85_12.c3d"  # a break dancer with 41 markers; CMU Graphics Lab
 _PANEL = 300  # [px] width of one of the three

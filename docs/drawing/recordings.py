@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from drawing import results
 from kinefit import read_motion
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.rendering import render_body
+from kinefit.bodies.rendering.looks import LEFT_COLOUR, RIGHT_COLOUR, to_hex
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.exporters import draw_overlay, write_motion
 from kinefit.exporters.pictures.drawing import draw_body
 from kinefit.exporters.report.cycles import PERCENT, find_cycles, normalised
@@ -21,9 +23,7 @@ from kinefit.readers.skeletons.bvh import read_bvh
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.readers.take.videos import TakePictures
-from kinefit.readers.video import Video
-from kinefit.rendering import render_body
-from kinefit.rendering.looks import LEFT_COLOUR, RIGHT_COLOUR, to_hex
+from kinefit.readers.videos.video import Video
 from kinefit.simulation import cut, movement, retarget, squat_and_wave, write_synthetic_take
 from kinefit.takes.missing import find_cameras
 

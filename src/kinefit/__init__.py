@@ -17,6 +17,10 @@ from importlib import import_module  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
 
+from kinefit._moved import MOVED, MovedFinder  # noqa: E402
+
+sys.meta_path.insert(0, MovedFinder())
+
 __version__ = "0.2.0"
 
 
@@ -36,6 +40,8 @@ def __getattr__(name: str) -> Any:
         return import_module(f"{module}.{attribute}")
     if module:
         return getattr(import_module(module), attribute)
+    if name in MOVED:
+        return import_module(f"kinefit.{name}")
     raise AttributeError(f"module 'kinefit' has no attribute '{name}'")
 
 

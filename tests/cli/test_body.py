@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from tests.solvers.test_closed import LEG
+from tests.solving.test_closed import LEG
 
 from kinefit.bodies import catalogue, load_body
 from kinefit.cli import main

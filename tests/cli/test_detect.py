@@ -17,12 +17,12 @@ from kinefit.exporters.motion_file import write_detections
 from kinefit.images.detectors.box_detector import DetectedPerson
 from kinefit.images.detectors.roi import SIZE, PersonLandmarks
 from kinefit.observations import Detections
-from kinefit.preparing import detecting, each_video
-from kinefit.preparing.take import ensure_detections, with_detections
-from kinefit.readers.detections import detections_file, read_detections
+from kinefit.readers.landmarks.detections import detections_file, read_detections
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
+from kinefit.takes.preparing import detecting, each_video
+from kinefit.takes.preparing.take import ensure_detections, with_detections
 from kinefit.takes.track import track_take
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
@@ -182,7 +182,7 @@ def test_one_damaged_video_stops_all_and_leaves_whole_files_only(take):
 
 def see_nobody_in(monkeypatch, *videos):
     """Let the pictures of some videos be black."""
-    from kinefit.readers.video import Video
+    from kinefit.readers.videos.video import Video
 
     frames = Video.frames
 
@@ -261,7 +261,7 @@ def test_the_missing_extra_is_told_before_anything_is_fetched(monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "ai_edge_litert.interpreter", None)
-    monkeypatch.setattr("kinefit.assets.detector_models", lambda progress: pytest.fail("fetched"))
+    monkeypatch.setattr("kinefit.readers.assets.detector_models", lambda progress: pytest.fail("fetched"))
     with pytest.raises(ObservationError, match=r"pip install 'kinefit\[detect\]'"):
         detecting.networks(None, pytest.fail)
 
@@ -275,12 +275,12 @@ def test_the_licence_is_shown_when_the_networks_are_fetched(monkeypatch, tmp_pat
         progress(36_000_000, 36_000_000)
         return tmp_path
 
-    monkeypatch.setattr("kinefit.assets.detector_models", fetch)
+    monkeypatch.setattr("kinefit.readers.assets.detector_models", fetch)
     steps, said = [], []
     assert detecting.networks(lambda *step: steps.append(step), said.append).folder == tmp_path
     assert len(said) == 1 and "Apache-2.0" in said[0] and "MediaPipe" in said[0]
     assert steps == [("download MB", 0, 36), ("download MB", 36, 36)]
-    monkeypatch.setattr("kinefit.assets.detector_models", lambda progress: tmp_path)
+    monkeypatch.setattr("kinefit.readers.assets.detector_models", lambda progress: tmp_path)
     detecting.networks(None, pytest.fail)  # nothing is said when they are there already
 
 
@@ -288,8 +288,8 @@ def test_the_licence_is_shown_when_the_networks_are_fetched(monkeypatch, tmp_pat
 def test_a_quality_is_a_landmark_network(monkeypatch, tmp_path, quality, file):
     monkeypatch.undo()
     pytest.importorskip("ai_edge_litert")
-    monkeypatch.setattr("kinefit.assets.detector_models", lambda progress: tmp_path / "pip")
-    monkeypatch.setattr("kinefit.assets.landmark_models", lambda progress: tmp_path / "npm")
+    monkeypatch.setattr("kinefit.readers.assets.detector_models", lambda progress: tmp_path / "pip")
+    monkeypatch.setattr("kinefit.readers.assets.landmark_models", lambda progress: tmp_path / "npm")
     found = detecting.networks(None, pytest.fail, quality)
     assert (found.folder, found.landmarks.name, found.name) == (
         tmp_path / "pip", f"pose_landmark_{file}.tflite", quality
@@ -304,8 +304,8 @@ def test_where_the_large_network_cannot_be_had_the_other_stands_in_and_says_so(m
     def offline(progress):
         raise AssetError("npm could not fetch @mediapipe/pose", remedy="Check the network.")
 
-    monkeypatch.setattr("kinefit.assets.detector_models", lambda progress: tmp_path)
-    monkeypatch.setattr("kinefit.assets.landmark_models", offline)
+    monkeypatch.setattr("kinefit.readers.assets.detector_models", lambda progress: tmp_path)
+    monkeypatch.setattr("kinefit.readers.assets.landmark_models", offline)
     said = []
     found = detecting.networks(None, said.append, "best")
     assert found.name == "balanced" and found.landmarks == tmp_path / "pose_landmark_full.tflite"

@@ -7,16 +7,16 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from kinefit.batch.results import FORMATS
 from kinefit.bodies import catalogue, load_body
 from kinefit.bodies.toml import records
 from kinefit.bodies.toml.bodies import JOINT_TYPES
 from kinefit.exporters import tables
-from kinefit.readers.keypoint_sets import KEYPOINT_SETS
+from kinefit.readers.landmarks.keypoint_sets import KEYPOINT_SETS
 from kinefit.readers.take import entries
 from kinefit.readers.take import file as takes
 from kinefit.sensors.kinds.silhouettes import SilhouetteEntry
 from kinefit.simulation import cut, squat_and_wave
+from kinefit.takes.batch.results import FORMATS
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 TAKE, BODIES, FILES = ((DOCS / f"{name}.md").read_text(encoding="utf-8") for name in ("take-file", "bodies", "files"))

@@ -19,10 +19,10 @@ import kinefit.cli
 from kinefit.bodies import load_body
 from kinefit.cli import main
 from kinefit.errors import TakeError
+from kinefit.fitting.tracking.take_recording import recording_of
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave
-from kinefit.tracking.take_recording import recording_of
 
 
 def run(*args):
@@ -125,7 +125,7 @@ def test_one_video_of_a_telephone_can_be_tracked(tmp_path, data_dir):
 
 def clicked(folder, motion, frame=3, names=None):
     """Clicks on the joints of a drawn take, as JSON has them."""
-    from kinefit.initialization.from_clicks import clickable
+    from kinefit.fitting.initialization.from_clicks import clickable
 
     body, seen = motion.body, load_observations(read_take(folder / "take.toml"))
     points = body.landmarks.select(names or clickable(body))
@@ -162,8 +162,8 @@ def test_clicked_joints_give_body_and_start(folder, tmp_path):
 
 def test_clicks_are_measurements_of_their_frames(folder, tmp_path):
     """Clicks of two frames stay with the take: each frame of them alone gives the pose that was clicked there."""
+    from kinefit.fitting.tracking.take_recording import recording_of
     from kinefit.observations import LineFrame
-    from kinefit.tracking.take_recording import recording_of
 
     motion = squat_and_wave()
     assert run("init", folder).exit_code == 0

@@ -11,26 +11,26 @@ import pytest
 from click.testing import CliRunner
 
 from kinefit import load_body, read_motion
+from kinefit.bodies.rendering import render_body
 from kinefit.cli import main
 from kinefit.cli.tracking.track import track as command
 from kinefit.errors import KinefitError
 from kinefit.exporters import write_markers, write_motion
+from kinefit.fitting.smoothing.online.lag_frame import KnownNoise
+from kinefit.fitting.subject.subject import Subject
+from kinefit.fitting.tracking.recording import Recording
+from kinefit.fitting.tracking.take_recording import recording_of
+from kinefit.fitting.tracking.tracker import Tracker
+from kinefit.fitting.tracking.video import track
 from kinefit.observations import Markers
 from kinefit.readers.take.entries import keys_of
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import cut
 from kinefit.simulation.movements import movement, people
 from kinefit.simulation.recordings import write_recording
-from kinefit.smoothing.online.lag_frame import KnownNoise
-from kinefit.subject.subject import Subject
 from kinefit.takes.track import track_take
-from kinefit.tracking.recording import Recording
-from kinefit.tracking.take_recording import recording_of
-from kinefit.tracking.tracker import Tracker
-from kinefit.tracking.video import track
 
 KINDS = ("keypoints", "depth", "silhouettes", "markers")
 FRAMES = 6
@@ -295,7 +295,7 @@ def test_progress_is_told(kind, folder):
 
 
 def a_recording(**more):
-    from tests.tracking.movements import RATE, a_rig, marker_frame
+    from tests.fitting.tracking.movements import RATE, a_rig, marker_frame
 
     steps = [[marker_frame(i, ("neck", "r_hip", "l_hip", "r_wrist"))] for i in range(3)]
     return Recording.of_frames(steps, a_rig(), rate=RATE, **more)
@@ -314,7 +314,7 @@ def test_an_argument_of_a_recording_is_refused_where_it_means_nothing(given):
     {"rate": 0.0}, {"sigma": {"mocap": 0.0}}, {"on_body": ("nobody",)}, {"values": {"rope": {"length": 1.0}}},
 ])  # fmt: skip
 def test_an_argument_of_a_tracker_is_refused_where_it_means_nothing(given):
-    from tests.tracking.movements import BODY, a_rig
+    from tests.fitting.tracking.movements import BODY, a_rig
 
     with pytest.raises(KinefitError):
         Tracker(BODY, a_rig(), **given)
@@ -324,7 +324,7 @@ def test_an_argument_of_a_tracker_is_refused_where_it_means_nothing(given):
 
 
 def test_cameras_that_share_no_step_are_told():
-    from tests.tracking.movements import BODY, RATE, a_rig, keypoint_frame
+    from tests.fitting.tracking.movements import BODY, RATE, a_rig, keypoint_frame
 
     steps = [[keypoint_frame(i, "left" if i < 4 else "right")] for i in range(8)]
     with pytest.raises(KinefitError, match="frame|step|camera"):

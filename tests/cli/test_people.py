@@ -49,7 +49,7 @@ def test_a_point_that_no_camera_ever_sees(tmp_path):
 
 
 def test_what_the_cameras_saw_is_read_once_for_all(take, tmp_path, monkeypatch):
-    from kinefit.multiview import followed
+    from kinefit.fitting.multiview import followed
     from kinefit.takes import in_view
     from kinefit.takes import track as module
 
@@ -111,7 +111,7 @@ def test_one_report_leads_to_all(take, tmp_path, monkeypatch):
         assert f'href="person-{k}/report.html"' in page and (tmp_path / f"person-{k}" / "report.html").is_file()
     assert "2 of 2 people in view were tracked" in page and "Range of motion" in page and "<figure" not in page
 
-    from kinefit.batch.summary import Row, failed, write_people_report
+    from kinefit.takes.batch.summary import Row, failed, write_people_report
 
     rows = [failed(Row(take="a", person=1, folder="person-1"), "nothing <of> it"), Row(take="a", person=2)]
     page = write_people_report(rows, tmp_path / "other", pictures=True).read_text()

@@ -7,9 +7,9 @@ from click.testing import CliRunner
 
 from kinefit import read_calibration, read_motion
 from kinefit.bodies import BodyState
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.rendering import render_body, scaled
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.cli import main
-from kinefit.rendering import render_body, scaled
 
 FRAMES = 9
 

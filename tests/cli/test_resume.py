@@ -3,15 +3,15 @@
 import os
 
 from click.testing import CliRunner
-from tests.tracking.checkpoints.test_checkpoint import assert_same
+from tests.fitting.tracking.checkpoints.test_checkpoint import assert_same
 
 from kinefit import read_motion
-from kinefit.batch import one
 from kinefit.cli import main
+from kinefit.fitting.tracking import run as running
+from kinefit.fitting.tracking.checkpoints.checkpoint import key_of
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.readers.take.file import read_take
-from kinefit.tracking import run as running
-from kinefit.tracking.checkpoints.checkpoint import key_of
-from kinefit.tracking.tracker import Tracker
+from kinefit.takes.batch import one
 
 
 def test_its_key_tells_files_and_options(take):

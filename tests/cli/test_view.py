@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from tests.cli.stopping import STOPPABLE
-from tests.viewers.recordings import write_take
+from tests.studio.viewers.recordings import write_take
 
-from kinefit.batch.viewed import gather
 from kinefit.cli.view import view
 from kinefit.errors import ExportError, FileError, ObservationError
 from kinefit.exporters import write_motion
 from kinefit.simulation import cut, squat_and_wave
+from kinefit.studio.viewers.viewed import gather
 
 
 @pytest.fixture(scope="module")

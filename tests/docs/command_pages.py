@@ -19,7 +19,7 @@ from kinefit import Markers, learn_model
 from kinefit.bodies.marker_sets import placement
 from kinefit.exporters import write_markers, write_motion
 from kinefit.geometry.camera import Rig
-from kinefit.identification.model.model import save_model
+from kinefit.markers.model.model import save_model
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave
 

@@ -7,16 +7,16 @@ from functools import cache
 import cv2
 import numpy as np
 from benchmarks.bar_scene import bar_rig, draw_bar, wave_bar
-from tests.calibration.board import test_calibrate as boards
+from tests.rigs.board import test_calibrate as boards
 
 import kinefit
-from kinefit.bodies.body_surfaces import sample
-from kinefit.calibration.board.detection import Board
+from kinefit.bodies.rendering import render_body
+from kinefit.bodies.surfaces.places import sample
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import SilhouetteFrame
 from kinefit.readers.calibration.read import write_calibration
-from kinefit.rendering import render_body
+from kinefit.rigs.board.detection import Board
 from kinefit.simulation import cut, draw_figure, simulate_keypoints, squat_and_wave, studio_rig
 
 RATE = 30.0

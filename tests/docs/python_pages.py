@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from tests.docs import drawn
 from tests.docs.world import world
-from tests.subject.measured import pixels
+from tests.fitting.subject.measured import pixels
 
 import kinefit
 from kinefit.bodies import load_body
@@ -20,7 +20,7 @@ from kinefit.bodies.parts import free_parts, parts_state
 from kinefit.exporters import write_markers, write_motion
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, KeypointFrame, PointCloud
-from kinefit.readers.keypoints import read_keypoints
+from kinefit.readers.landmarks.keypoints import read_keypoints
 from kinefit.simulation import simulate_keypoints
 
 

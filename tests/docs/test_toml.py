@@ -11,7 +11,7 @@ from tests.docs.blocks import blocks, pages
 from kinefit.bodies import load_body
 from kinefit.bodies.marker_sets import placement
 from kinefit.cli import main
-from kinefit.readers.annotations import read_static_points
+from kinefit.readers.landmarks.annotations import read_static_points
 from kinefit.readers.take.entries import TABLES
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.kinds import BUILT_IN

@@ -7,8 +7,8 @@ import numpy as np
 
 import kinefit
 from kinefit.bodies.marker_sets import placement
+from kinefit.bodies.motion import UP_AXES
 from kinefit.geometry.camera import Rig
-from kinefit.motion import UP_AXES
 from kinefit.observations import KeypointFrame
 from kinefit.simulation import (
     KINECT,

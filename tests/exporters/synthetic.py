@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from kinefit.bodies import load_body
+from kinefit.bodies.motion import Motion, Residuals
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
-from kinefit.motion import Motion, Residuals
 
 
 def smooth_motion(frames=40, rate=60.0, up="y", seed=0, turns=1.2, body=None):

@@ -7,9 +7,9 @@ import pytest
 from tests.exporters.synthetic import smooth_motion
 
 from kinefit.bodies import PointSet, load_body
+from kinefit.bodies.motion import Motion
 from kinefit.errors import ExportError
 from kinefit.exporters import write_c3d
-from kinefit.motion import Motion
 from kinefit.readers.markers import read_markers
 
 

@@ -15,10 +15,10 @@ from kinefit.exporters.surface_files import (
     write_points_csv,
     write_surface_vtk,
 )
-from kinefit.photogrammetry.region_growing import Grid
-from kinefit.photogrammetry.strain import strain
-from kinefit.photogrammetry.surface import MeasuredSurface
-from kinefit.photogrammetry.trajectories import Trajectories
+from kinefit.images.photogrammetry.region_growing import Grid
+from kinefit.images.photogrammetry.strain import strain
+from kinefit.images.photogrammetry.surface import MeasuredSurface
+from kinefit.images.photogrammetry.trajectories import Trajectories
 
 
 @pytest.fixture

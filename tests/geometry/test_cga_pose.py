@@ -5,14 +5,14 @@ import pytest
 from tests.oracle import random_body, random_unit
 
 from kinefit.bodies import BodyState
-from kinefit.correspondences import edge_rows, plane_rows, ray_rows
 from kinefit.errors import ObservationError
 from kinefit.geometry import cga, cga_pose, lines, se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.cga import e, exp, line_of, motor_of, plane_of, point, twist, versor
 from kinefit.geometry.cga_pose import Constraint, estimate_pose, line_plane, point_line, point_plane
-from kinefit.rows import Rows
-from kinefit.solvers.least_squares import gauss_newton
+from kinefit.solving.correspondences import edge_rows, plane_rows, ray_rows
+from kinefit.solving.least_squares import gauss_newton
+from kinefit.solving.rows import Rows
 
 random = np.random.default_rng(0)
 x_a, x_b, x_c, x_d = random.normal(size=(4, 30, 3))

@@ -5,10 +5,10 @@ import pytest
 
 from kinefit.bodies import load_body
 from kinefit.errors import ObservationError, TrackingError
+from kinefit.fitting.initialization.from_depth import start_from_points
 from kinefit.geometry.camera import Camera
 from kinefit.images.depth import clean, denoised, to_points
 from kinefit.images.depth_scene import background_model, clusters, find_floor, foreground, people
-from kinefit.initialization.from_depth import start_from_points
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.simulation.figures import in_front
 from kinefit.simulation.movements import movement

@@ -16,13 +16,13 @@ from kinefit.bodies import load_body
 from kinefit.bodies.serial import body_to_arrays
 from kinefit.errors import BodyError, FileError, ObservationError
 from kinefit.observations import Detections
-from kinefit.readers.annotations import Clicks, read_clicks
 from kinefit.readers.depth.recordings import read_depth
+from kinefit.readers.landmarks.annotations import Clicks, read_clicks
 from kinefit.readers.ros import recordings
 from kinefit.readers.ros.images import shown
 from kinefit.readers.skeletons.characters import _order, read_character
 from kinefit.readers.skeletons.gltf import read_gltf
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 
 
 def test_no_pattern_at_the_start_of_lines_runs_over_lines():

@@ -23,16 +23,16 @@ from kinefit.bodies import load_body
 from kinefit.bodies.surfaces import Metaballs
 from kinefit.cli.surfaces._measure import read_seeds
 from kinefit.errors import BodyError, CalibrationError, FileError, KinefitError, ObservationError
-from kinefit.readers.annotations import read_static_points
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.depth.clouds import FileCloud, camera_of, read_cloud
 from kinefit.readers.depth.images import listed
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.guess.names import camera_number, natural
-from kinefit.readers.keypoints import read_caliscope_csv, read_keypoints
+from kinefit.readers.landmarks.annotations import read_static_points
+from kinefit.readers.landmarks.keypoints import read_caliscope_csv, read_keypoints
 from kinefit.readers.skeletons.acclaim import read_asf
 from kinefit.readers.take.file import read_take
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 from kinefit.sensors.kinds.surface_points import read_surface_points
 
 COPIES = 25  # of each reader here; `python -m benchmarks.product fuzz` reads thousands

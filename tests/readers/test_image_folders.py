@@ -9,7 +9,7 @@ import pytest
 from kinefit.errors import FileError, ObservationError
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.video import Video, VideoSet
+from kinefit.readers.videos.video import Video, VideoSet
 
 
 def draw(folder, numbers, ending=".png", size=(48, 32)):

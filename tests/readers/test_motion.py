@@ -7,11 +7,11 @@ import pytest
 from tests.exporters.synthetic import smooth_motion
 
 from kinefit.bodies import KinematicTree, catalogue, load_body
+from kinefit.bodies.lasting_errors import LastingErrors, ParameterErrors
+from kinefit.bodies.motion import ARRAYS, Residuals
 from kinefit.bodies.serial import body_from_arrays, body_to_arrays
 from kinefit.errors import BodyError, ExportError, FileError
 from kinefit.exporters import write_motion
-from kinefit.lasting_errors import LastingErrors, ParameterErrors
-from kinefit.motion import ARRAYS, Residuals
 from kinefit.readers.motion import read_motion
 
 

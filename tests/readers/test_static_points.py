@@ -3,7 +3,7 @@
 import pytest
 
 from kinefit.errors import FileError, ObservationError
-from kinefit.readers.annotations import read_static_points
+from kinefit.readers.landmarks.annotations import read_static_points
 
 GOOD = "[beam]\ncam1 = [512.5, 1204]\ncam3 = [430.1, 1311.8]\n"
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from tests.tracking.movements import BODY, RATE, a_motion, a_rig, images, marker_frame
+from tests.fitting.tracking.movements import BODY, RATE, a_motion, a_rig, images, marker_frame
 
-from kinefit.correspondences import point_rows
 from kinefit.observations import DepthFrame
-from kinefit.rows import PairRows
 from kinefit.sensors.base import Measurement, RowsOf, Sensor, Unknown
 from kinefit.sensors.visibility.occlusion import depth_behind
+from kinefit.solving.correspondences import point_rows
+from kinefit.solving.rows import PairRows
 
 HELD = (
     "neck", "hip_centre", "nose_tip", "r_hip", "l_hip", "r_shoulder", "l_shoulder", "r_elbow", "l_elbow", "r_knee",

@@ -5,10 +5,10 @@ from functools import cache
 import numpy as np
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.rendering import render_body
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import ColourFrame
-from kinefit.rendering import render_body
 
 BODY = load_body("humanoid")
 SKIN, SHIRT, TROUSERS = (200, 150, 130), (40, 80, 160), (60, 50, 40)

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from kinefit.bodies import BodyState, load_body
+from kinefit.bodies.rendering import render_body
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import ColourFrame
-from kinefit.rendering import render_body
 
 CAMERA = Camera("cam", (320, 240), [[420.0, 0, 159.5], [0, 420.0, 119.5], [0, 0, 1]])
 RIG = Rig((CAMERA,))

@@ -5,12 +5,12 @@ from functools import cache
 import numpy as np
 
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.rendering import render_body
 from kinefit.bodies.surfaces import MeshSurface
 from kinefit.bodies.tree import KinematicTree
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import ColourFrame
-from kinefit.rendering import render_body
 
 CAMERA = Camera("cam", (240, 200), [[300.0, 0, 119.5], [0, 300.0, 99.5], [0, 0, 1]])
 RIG = Rig((CAMERA,))

@@ -6,7 +6,7 @@ from tests.oracle import posture, rig_around
 
 from kinefit.bodies import load_body
 from kinefit.errors import KinefitError, ObservationError
-from kinefit.multiview.association import person_records
+from kinefit.fitting.multiview.association import person_records
 from kinefit.observations import Keypoints
 from kinefit.observations.recordings import mirror_name
 from kinefit.sensors.channels import exchange, fitted_pixels, joined, make_channels

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.fitting.tracking.movements import BODY, RATE, STILL, a_motion, a_rig, is_finite, marker_frame, turned
 from tests.sensors.fakes import (
     AWAY,
     DELAY,
@@ -25,19 +26,18 @@ from tests.sensors.fakes import (
     truth,
     value,
 )
-from tests.tracking.movements import BODY, RATE, STILL, a_motion, a_rig, is_finite, marker_frame, turned
 
-from kinefit.correspondences import point_rows
 from kinefit.errors import ObservationError
-from kinefit.rows import PairRows, Rows
+from kinefit.fitting.subject.fit import fit_subject
+from kinefit.fitting.subject.parameters import SegmentScales
+from kinefit.fitting.subject.sensor_parameters import OwnUnknowns
+from kinefit.fitting.tracking.recording import Recording
+from kinefit.fitting.tracking.tracker import Tracker
+from kinefit.fitting.tracking.video import track
 from kinefit.sensors.base import RowsOf, Sensor
 from kinefit.sensors.settings import TrackSettings
-from kinefit.subject.fit import fit_subject
-from kinefit.subject.parameters import SegmentScales
-from kinefit.subject.sensor_parameters import OwnUnknowns
-from kinefit.tracking.recording import Recording
-from kinefit.tracking.tracker import Tracker
-from kinefit.tracking.video import track
+from kinefit.solving.correspondences import point_rows
+from kinefit.solving.rows import PairRows, Rows
 
 SIGMA = {"mocap": 0.004}
 KNOWN = {"strut": {"length": LENGTH}, "rope": {"length": ROPE}, "clock": {"delay": DELAY}}

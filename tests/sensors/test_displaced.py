@@ -5,16 +5,16 @@ import pytest
 
 from kinefit.bodies import load_body
 from kinefit.errors import ObservationError
+from kinefit.fitting.subject.fit import fit_subject
+from kinefit.fitting.subject.sensor_parameters import SensorFrames
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.losses import SQUARED
+from kinefit.geometry.losses import SQUARED
 from kinefit.observations import MarkerFrame
 from kinefit.sensors.base import matched_by, rows_at
 from kinefit.sensors.displaced import CLOCK, Displaced, displacement
 from kinefit.sensors.points.markers import MarkerSensor
 from kinefit.sensors.scene import Scene
-from kinefit.subject.fit import fit_subject
-from kinefit.subject.sensor_parameters import SensorFrames
 
 BODY = load_body("humanoid")
 CENTRE = np.array([0.2, 1.0, -0.1])

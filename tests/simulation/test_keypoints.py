@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kinefit.bodies.motion import ARRAYS, UP_AXES
 from kinefit.errors import ExportError, ObservationError
-from kinefit.motion import ARRAYS, UP_AXES
 from kinefit.observations.recordings import mirror_name
-from kinefit.readers.keypoint_sets import KEYPOINT_SETS
+from kinefit.readers.landmarks.keypoint_sets import KEYPOINT_SETS
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 from kinefit.simulation import cut, draw_figure, simulate_keypoints, squat_and_wave, studio_rig, write_synthetic_take
 
 MOTION = squat_and_wave(rate=60.0, duration=4.0)

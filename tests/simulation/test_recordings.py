@@ -7,7 +7,7 @@ import pytest
 from kinefit.errors import ExportError, ObservationError
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 from kinefit.simulation import SENSORS, TOF, cut, simulate_depth, squat_and_wave, write_recording
 from kinefit.simulation.rendering.scenes import depth_picture
 

@@ -8,10 +8,10 @@ from tests.readers.skeletons.bvh_variants import along, any_frames, turned, writ
 
 from kinefit.bodies import load_body
 from kinefit.bodies.joint_names import recorded_joints
+from kinefit.bodies.motion import rotation_between_up
 from kinefit.errors import BodyError, ObservationError
 from kinefit.findings import of_provenance
 from kinefit.geometry import se3
-from kinefit.motion import rotation_between_up
 from kinefit.observations import SkeletonMotion
 from kinefit.readers.skeletons.acclaim import read_amc
 from kinefit.readers.skeletons.bvh import read_bvh

@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from kinefit.diagnostics.cameras import camera_biases, disagreement, frame_findings, without_points
-from kinefit.diagnostics.checks import check_keypoints
-from kinefit.diagnostics.rig import lens_findings, placement_findings
-from kinefit.diagnostics.views import make_views, with_sides_right
 from kinefit.findings import Finding, listed, ranked
+from kinefit.fitting.multiview.views import make_views, with_sides_right
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
 from kinefit.observations.recordings import mirror_name
+from kinefit.rigs.diagnostics.cameras import camera_biases, disagreement, frame_findings, without_points
+from kinefit.rigs.diagnostics.checks import check_keypoints
+from kinefit.rigs.diagnostics.rig import lens_findings, placement_findings
 from kinefit.simulation import (
     DepthSensor,
     cut,

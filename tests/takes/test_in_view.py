@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.tracking.depth_oracle import BODY, camera, facing
+from tests.fitting.tracking.depth_oracle import BODY, camera, facing
 
 from kinefit import Recording, track
+from kinefit.bodies.rendering import render_body
 from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame
-from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
 from kinefit.takes.in_view import people_in_depth
 

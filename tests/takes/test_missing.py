@@ -5,17 +5,17 @@ import re
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from tests.calibration.people.test_skeletons import FRAMES, LATE, seen, turn_errors
-from tests.calibration.people_data import BODY, room, walker
+from tests.rigs.people.test_skeletons import FRAMES, LATE, seen, turn_errors
+from tests.rigs.people_data import BODY, room, walker
 
 from kinefit import check_take, read_motion, read_take, track_take
 from kinefit.cli import main
 from kinefit.errors import FileError, TakeError
 from kinefit.exporters.motion_file import write_detections
-from kinefit.live.take import live_session
 from kinefit.observations import Detections
 from kinefit.readers.calibration.read import read_found
 from kinefit.readers.take.load import load_observations
+from kinefit.studio.live.take import live_session
 from kinefit.takes import missing
 from kinefit.takes.missing import cameras_file, find_cameras, last_found
 from kinefit.takes.track import trial_of

@@ -11,13 +11,13 @@ from kinefit.bodies.marker_sets import placement
 from kinefit.cli import main
 from kinefit.errors import KinefitError
 from kinefit.exporters import write_markers, write_motion
+from kinefit.fitting.tracking.take_recording import recording_of
 from kinefit.observations import Markers
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import cut, squat_and_wave
 from kinefit.simulation.movements import movement, people
 from kinefit.takes.track import track_take
-from kinefit.tracking.take_recording import recording_of
 
 MARKERS = ("l_wrist", "r_wrist", "l_knee")
 

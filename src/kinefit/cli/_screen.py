@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from kinefit import __version__
-from kinefit.batch.results import Step
 from kinefit.errors import ExportError, KinefitError, choices
 from kinefit.readers.plugins import install
-from kinefit.serving import TOKEN_VARIABLE
+from kinefit.studio.serving import TOKEN_VARIABLE
+from kinefit.takes.batch.results import Step
 
 if TYPE_CHECKING:
     from rich.console import Console

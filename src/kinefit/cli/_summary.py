@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kinefit.batch.results import description
 from kinefit.cli._screen import print_table, say
 from kinefit.findings import frame_ranges
+from kinefit.takes.batch.results import description
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from kinefit.motion import Motion, Residuals
+    from kinefit.bodies.motion import Motion, Residuals
 
 MOMENTS = 5  # doubtful moments that are listed, the worst first
 
@@ -124,15 +124,15 @@ def bone_lengths(motion: Motion) -> dict[str, str]:
 
 def _median_of(r: Residuals) -> float | None:
     """Median length of the residuals, in their unit; None where no point was seen."""
-    from kinefit.motion import known_median
+    from kinefit.bodies.motion import known_median
 
     median = known_median(r.norms)
     return median if np.isfinite(median) else None
 
 
 def _print_points(motion: Motion) -> None:
+    from kinefit.bodies.motion import SHOWN_UNITS
     from kinefit.exporters.report.fit import point_medians
-    from kinefit.motion import SHOWN_UNITS
 
     names = list(dict.fromkeys(name for r in motion.residuals.values() for name in r.names))
     medians = [(point_medians(r), SHOWN_UNITS[r.unit][1]) for r in motion.residuals.values()]

@@ -59,7 +59,7 @@ def copy(name: str, file: Path | None) -> None:
 def check(file: str, planar: bool) -> None:
     """Compare Gruebler's count of a body with the rank of its closures; name redundant and contradictory closures."""
     from kinefit.bodies import load_body
-    from kinefit.solvers.mobility import check_closed, mobility
+    from kinefit.solving.mobility import check_closed, mobility
 
     one = load_body(file)
     m = mobility(one, planar=planar)
@@ -92,8 +92,8 @@ def refine(file: str, balls: int, out: Path) -> None:
     """Refine a body of three metaballs a limb (a name, a body file, or motion.npz of a fit) to a fuller set."""
     from kinefit.bodies import load_body
     from kinefit.bodies.serial import save_body
+    from kinefit.fitting.subject.metaballs import refined_body
     from kinefit.readers.motion import read_motion
-    from kinefit.subject.metaballs import refined_body
 
     _screen.check_file(out)
     one = read_motion(file).body if Path(file).name == "motion.npz" or Path(file).is_dir() else load_body(file)

@@ -14,9 +14,9 @@ from kinefit.cli._screen import CommandGroup
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from kinefit.calibration.bar.calibrate import BarCalibration
-    from kinefit.calibration.bar.targets import BarViews
-    from kinefit.calibration.board.calibrate import BoardCalibration
+    from kinefit.rigs.bar.calibrate import BarCalibration
+    from kinefit.rigs.bar.targets import BarViews
+    from kinefit.rigs.board.calibrate import BoardCalibration
 
 _EXAMPLES = """\b
 Examples:
@@ -61,10 +61,10 @@ def board(
     synchronised: equal frame numbers mean equal times. The side of a square gives the scale; the board on the floor
     (--floor) gives the origin and the vertical.
     """
-    from kinefit.calibration.board.calibrate import calibrate_board
-    from kinefit.calibration.board.detection import Board
-    from kinefit.calibration.board.sources import camera_sources, find_boards
     from kinefit.readers.calibration.read import read_calibration, write_calibration
+    from kinefit.rigs.board.calibrate import calibrate_board
+    from kinefit.rigs.board.detection import Board
+    from kinefit.rigs.board.sources import camera_sources, find_boards
 
     described = Board.parse(spec)
     found = camera_sources(sources)
@@ -85,7 +85,7 @@ def board(
 
 def _frame(floor: str | None, sources: dict) -> int | None:
     """Frame number of "12" or "3.5s"."""
-    from kinefit.readers.video import Video
+    from kinefit.readers.videos.video import Video
 
     if floor is None:
         return None
@@ -160,8 +160,8 @@ def bar(
     Give a video for each camera, named like the camera, or folders of images. The videos must be synchronised: equal
     frame numbers mean equal times. Or give a CSV file of centroids: camera,frame,u,v, with two rows for each image.
     """
-    from kinefit.calibration.bar.calibrate import LENGTH_SIGMA, calibrate_bar, check_bar
     from kinefit.readers.calibration.read import read_calibration, write_calibration
+    from kinefit.rigs.bar.calibrate import LENGTH_SIGMA, calibrate_bar, check_bar
 
     sigma = LENGTH_SIGMA if length_sigma is None else length_sigma
     check_bar(length, sigma)
@@ -189,11 +189,11 @@ def _seen(
     sources: tuple[Path, ...], size: str | None, kept: object, max_frames: int, include: tuple[int, ...],
     step: _screen.Step,
 ) -> dict[str, BarViews]:
-    from kinefit.calibration.bar.calibrate import check_cameras
-    from kinefit.calibration.bar.table import read_centroids
-    from kinefit.calibration.bar.targets import find_bars
-    from kinefit.calibration.board.sources import camera_sources
     from kinefit.geometry.camera import Rig
+    from kinefit.rigs.bar.calibrate import check_cameras
+    from kinefit.rigs.bar.table import read_centroids
+    from kinefit.rigs.bar.targets import find_bars
+    from kinefit.rigs.board.sources import camera_sources
 
     if not any(path.suffix.lower() == ".csv" for path in sources):
         if size is not None:
@@ -340,10 +340,10 @@ def people(
     from statistics import median
 
     from kinefit.bodies import load_body
-    from kinefit.calibration.people.calibrate import calibrate_people
-    from kinefit.preparing.take import with_detections
     from kinefit.readers.calibration.read import write_calibration
     from kinefit.readers.take.file import find_take, read_take
+    from kinefit.rigs.people.calibrate import calibrate_people
+    from kinefit.takes.preparing.take import with_detections
     from kinefit.takes.track import load_keypoints
 
     take = find_take(take, wanted=("calibrate", "people"))

@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from kinefit.cli import _screen
-from kinefit.preparing import detecting
-from kinefit.preparing.take import somebody
+from kinefit.takes.preparing import detecting
+from kinefit.takes.preparing.take import somebody
 
 _MIN_HAND_CONFIDENCE = 0.5  # confidence of a hand
 
@@ -88,7 +88,7 @@ def _jobs(inputs: tuple[Path, ...], out: Path | None) -> list[detecting.Detectio
 
 def _show(jobs: list[detecting.DetectionJob], done: list[detecting.DetectionJob]) -> None:
     """One line for each video."""
-    from kinefit.readers.detections import read_detections
+    from kinefit.readers.landmarks.detections import read_detections
 
     for job in jobs:
         found = read_detections(job.file)

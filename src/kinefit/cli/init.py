@@ -15,7 +15,7 @@ from kinefit.errors import TakeError, TrackingError, choices
 
 if TYPE_CHECKING:
     from kinefit.bodies import Body
-    from kinefit.readers.annotations import Clicks
+    from kinefit.readers.landmarks.annotations import Clicks
     from kinefit.readers.take.file import Take
     from kinefit.readers.take.load import Observations
 
@@ -72,7 +72,7 @@ def init(
     write_text(out, guess.text)
     show(guess.notes)
     if hide_faces:
-        from kinefit.preparing.ingest import hide_in_copies
+        from kinefit.takes.preparing.ingest import hide_in_copies
 
         with _screen.bars() as progress:
             copies = hide_in_copies(out, progress, _screen.note)
@@ -139,7 +139,7 @@ def start_from_clicks(out: Path, points: Path | None, step: int | None, body: st
     body : name or file of the body
     """
     from kinefit.bodies import load_body
-    from kinefit.readers.annotations import read_clicks
+    from kinefit.readers.landmarks.annotations import read_clicks
     from kinefit.readers.take.file import read_take
     from kinefit.readers.take.load import load_observations
     from kinefit.takes.missing import last_found
@@ -159,9 +159,9 @@ def _ask(out: Path, take: Take, seen: Observations, body: Body, step: int, brows
     """Show the page until its clicks give a start."""
     import webbrowser
 
-    from kinefit.initialization.from_clicks import clickable
-    from kinefit.readers.annotations import clicks_of
-    from kinefit.viewers.clicks import ClickPage
+    from kinefit.fitting.initialization.from_clicks import clickable
+    from kinefit.readers.landmarks.annotations import clicks_of
+    from kinefit.studio.viewers.clicks import ClickPage
 
     def taken(clicks: Any) -> str:
         return _started(out, take, seen, body, [clicks_of(clicks)])
@@ -182,7 +182,7 @@ def _pictures(take: Take, seen: Observations, step: int) -> dict[str, bytes]:
     """JPEG of every image that cameras took at a step."""
     import cv2
 
-    from kinefit.preparing.faces import shown_video
+    from kinefit.takes.preparing.faces import shown_video
 
     if not seen.frames[0] <= step < seen.frames[1]:
         problem = f"step {step} is outside the recording's steps {seen.frames[0]} to {seen.frames[1] - 1}"
@@ -208,8 +208,8 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, steps: Seque
 
     from kinefit._files import regular, write_text
     from kinefit.bodies.serial import save_body
-    from kinefit.initialization.from_clicks import clickable, clicked_points, clicked_start
-    from kinefit.readers.annotations import clicks_text
+    from kinefit.fitting.initialization.from_clicks import clickable, clicked_points, clicked_start
+    from kinefit.readers.landmarks.annotations import clicks_text
 
     assert seen.rig is not None
     clicks = steps[0]

@@ -10,8 +10,8 @@ import click
 from kinefit.cli import _screen
 
 if TYPE_CHECKING:
-    from kinefit.serving.access import Access
-    from kinefit.viewers.show import ViewerContent
+    from kinefit.studio.serving.access import Access
+    from kinefit.studio.viewers.show import ViewerContent
 
 
 @click.command(short_help="Show a motion, a take or a folder of results in 3D.", epilog="""\b
@@ -41,8 +41,8 @@ def view(
     SOURCE is a motion file (.npz), a take file (.toml) or a folder that `kinefit track` wrote. Further motions are
     shown in the same scene. Ctrl-C ends the command.
     """
-    from kinefit.batch.viewed import gather
-    from kinefit.serving.access import Access
+    from kinefit.studio.serving.access import Access
+    from kinefit.studio.viewers.viewed import gather
 
     if html is not None:
         _screen.check_file(html, "--html")
@@ -55,9 +55,9 @@ def view(
 
 
 def _serve(recording: ViewerContent, port: int, access: Access, browser: bool, cylinders: bool) -> None:
-    from kinefit.viewers.player import Player
-    from kinefit.viewers.show import CYLINDERS, DEFAULT_LAYERS
-    from kinefit.viewers.stage import open_server, quiet
+    from kinefit.studio.viewers.player import Player
+    from kinefit.studio.viewers.show import CYLINDERS, DEFAULT_LAYERS
+    from kinefit.studio.viewers.stage import open_server, quiet
 
     server = open_server(port, access, label=f"kinefit: {recording.name}")
     try:
@@ -81,7 +81,7 @@ def _serve(recording: ViewerContent, port: int, access: Access, browser: bool, c
 
 def _write(recording: ViewerContent, html: Path, cylinders: bool) -> None:
     from kinefit._files import write_text
-    from kinefit.viewers.show import CYLINDERS, DEFAULT_LAYERS, Choice, page
+    from kinefit.studio.viewers.show import CYLINDERS, DEFAULT_LAYERS, Choice, page
 
     _screen.note("Rendering the scene ...")
     text, frames = page(recording, choice=Choice(CYLINDERS if cylinders else DEFAULT_LAYERS))
@@ -108,9 +108,9 @@ def app(folder: Path, port: int, token: str | None, browser: bool) -> None:
     here ends the app, and what is computed goes on from there the next time. Needs the extra `app`:
     pip install 'kinefit[app]'.
     """
-    from kinefit.app.server import serve
     from kinefit.errors import FileError, printable
-    from kinefit.serving.access import Access
+    from kinefit.studio.app.server import serve
+    from kinefit.studio.serving.access import Access
 
     root = folder.absolute()
     if not root.is_dir():

@@ -28,10 +28,10 @@ def warmup() -> None:
 
     Also downloads plotly.js (10 MB), which draws the plots of reports: afterwards a computer needs no network.
     """
-    from kinefit import assets
     from kinefit._jit import kernel_folder
     from kinefit._threads import Pool
     from kinefit.errors import AssetError
+    from kinefit.readers import assets
 
     begin = perf_counter()
     with _screen.bars() as step, Pool(_PROCESSES) as pool:
@@ -60,15 +60,15 @@ def _surfaces() -> None:
     import numpy as np
 
     from kinefit.bodies import load_body
+    from kinefit.fitting.tracking.tracker import Tracker
     from kinefit.geometry.camera import Camera, Rig
     from kinefit.geometry.se3 import transform
+    from kinefit.images.photogrammetry.region_growing import Grid
+    from kinefit.images.photogrammetry.spline_image import SplineImage
+    from kinefit.images.photogrammetry.states import measure_states, surface_strain
+    from kinefit.images.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
     from kinefit.observations import SurfacePointFrame
-    from kinefit.photogrammetry.region_growing import Grid
-    from kinefit.photogrammetry.spline_image import SplineImage
-    from kinefit.photogrammetry.states import measure_states, surface_strain
-    from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
     from kinefit.sensors.surfaces.surface_points import SurfacePointSensor
-    from kinefit.tracking.tracker import Tracker
 
     random, places = np.random.default_rng(0), (0.0, -0.12, 0.12)
     K = np.array([[300.0, 0.0, 79.5], [0.0, 300.0, 59.5], [0.0, 0.0, 1.0]])

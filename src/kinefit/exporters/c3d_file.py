@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import LENGTHS, write_bytes, write_text
+from kinefit.bodies.motion import Motion
 from kinefit.errors import ExportError
 from kinefit.exporters.opensim import trc_head
 from kinefit.exporters.report.cycles import find_gait
 from kinefit.exporters.skeletons.common import UNITS, bone_names, convention, length_factor, plain_names, turned
 from kinefit.exporters.tables import Curve, curves
-from kinefit.motion import Motion
 from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
 

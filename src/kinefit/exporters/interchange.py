@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import writing
+from kinefit.bodies.motion import Motion
 from kinefit.errors import ExportError, extra
 from kinefit.exporters.skeletons.common import bone_names, convention, plain_names, rest_pose, turned
-from kinefit.motion import Motion
 
 CONFIDENCE_RADIUS_M = 0.02
 """[m] within which `confidence` has the true joint centre."""

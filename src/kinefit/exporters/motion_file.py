@@ -1,4 +1,4 @@
-"""Writing the files of kinefit's own, which `kinefit.readers.motion` and `kinefit.readers.detections` read."""
+"""Writing the files of kinefit's own, which `readers.motion` and `readers.landmarks.detections` read."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from kinefit._arguments import checked
 from kinefit._files import write_lines, writing
 from kinefit._mapped import release
 from kinefit.bodies import Body
+from kinefit.bodies.motion import Motion
 from kinefit.bodies.serial import arrays_of, body_to_arrays
 from kinefit.errors import ExportError
 from kinefit.exporters.skeletons.common import turned
 from kinefit.geometry import se3
-from kinefit.motion import Motion
 from kinefit.observations import Detections
-from kinefit.readers import detections as detections_format
 from kinefit.readers import motion as motion_format
+from kinefit.readers.landmarks import detections as detections_format
 
 
 @checked

@@ -19,10 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._arguments import checked
 from kinefit._files import write_lines, write_text
 from kinefit.bodies import Body, PointSet, TaperedCylinder
+from kinefit.bodies.motion import Motion
 from kinefit.bodies.surfaces import Surface
 from kinefit.errors import ExportError
 from kinefit.exporters.skeletons.common import UNITS, check_up, euler, euler_zxy, length_factor, numbers, plain_names
-from kinefit.motion import Motion
 
 PERSON = 75.0  # [kg]
 SHARES = {

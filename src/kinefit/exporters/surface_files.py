@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from kinefit._files import write_bytes, write_image, write_rows
 from kinefit.errors import ExportError
-from kinefit.photogrammetry.returning import PointReturn
-from kinefit.photogrammetry.states import displacement_std
-from kinefit.photogrammetry.strain import Strain
-from kinefit.photogrammetry.surface import MeasuredSurface
-from kinefit.photogrammetry.trajectories import Trajectories
+from kinefit.images.photogrammetry.returning import PointReturn
+from kinefit.images.photogrammetry.states import displacement_std
+from kinefit.images.photogrammetry.strain import Strain
+from kinefit.images.photogrammetry.surface import MeasuredSurface
+from kinefit.images.photogrammetry.trajectories import Trajectories
 
 _MAX_IMAGE_SIDE_PX = 1400  # [px] of a picture's longer side
 _BAR = 90  # [px] of the scale beside it

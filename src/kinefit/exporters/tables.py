@@ -27,10 +27,7 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import writing
-from kinefit.errors import ExportError, extra
-from kinefit.exporters.opensim import root_coordinates
-from kinefit.exporters.skeletons.common import UNITS, bone_names, euler_zxy, length_factor, turned
-from kinefit.motion import (
+from kinefit.bodies.motion import (
     Motion,
     angle_columns,
     continuous_quaternions,
@@ -38,6 +35,9 @@ from kinefit.motion import (
     place_columns,
     rotation_between_up,
 )
+from kinefit.errors import ExportError, extra
+from kinefit.exporters.opensim import root_coordinates
+from kinefit.exporters.skeletons.common import UNITS, bone_names, euler_zxy, length_factor, turned
 
 
 @dataclass(frozen=True, eq=False)

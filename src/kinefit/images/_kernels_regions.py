@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from kinefit._jit import jit
-from kinefit.rendering._kernels import rasterise
+from kinefit.bodies.rendering._kernels import rasterise
 
 UNKNOWN = 1e6  # in a table of log ratios: not computed yet
 

@@ -1,1 +1,1 @@
-"""Labelled markers: placement on a body, subject, poses."""
+"""Unlabelled markers: who is who (P5)."""

@@ -15,7 +15,7 @@ F frames, S segments, D coordinates; metres, radians, seconds, pixels; float64 u
     quality (F,)  segment_quality (F, S)              0..1
     body/...                         the fitted body, in the format of `kinefit.bodies.serial`
     lasting/frames (K,)              int, key frames of the errors that frames have in common; all of lasting/ optional
-    lasting/constant (K, 6 + D, k)  drift (K, 6 + D, m)  drift_time ()   float16, see `kinefit.lasting_errors`; [s]
+    lasting/constant (K, 6 + D, k)  drift (K, 6 + D, m)  drift_time ()   float16, `bodies.lasting_errors`; [s]
     lasting/parameters/names (p,)  values (p,)  covariance (p, p)  information (p, p)  directions (k, p)     optional
     residuals/SENSOR/names (K,)  segments (K,)        points of a sensor, and the segment of each
     residuals/SENSOR/unit ()         "px" or "m"
@@ -38,10 +38,10 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import read_npz, regular
+from kinefit.bodies.lasting_errors import LastingErrors, ParameterErrors
+from kinefit.bodies.motion import Motion, Residuals
 from kinefit.bodies.serial import below, body_from_arrays, fields_of, prefixes
 from kinefit.errors import FileError, KinefitError, command
-from kinefit.lasting_errors import LastingErrors, ParameterErrors
-from kinefit.motion import Motion, Residuals
 
 FORMAT, VERSION = "kinefit motion", 1
 SHAPES = {

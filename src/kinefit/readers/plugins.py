@@ -315,8 +315,9 @@ class FileFormats(Extensions[FileFormat]):
 
 
 KEYPOINTS = FileFormats("kinefit.readers", FileFormat, "keypoint format", {
-    "openpose": "kinefit.readers.keypoints:OPENPOSE", "mediapipe": "kinefit.readers.keypoints:MEDIAPIPE",
-    "caliscope": "kinefit.readers.keypoints:CALISCOPE",
+    "openpose": "kinefit.readers.landmarks.keypoints:OPENPOSE",
+    "mediapipe": "kinefit.readers.landmarks.keypoints:MEDIAPIPE",
+    "caliscope": "kinefit.readers.landmarks.keypoints:CALISCOPE",
 }, _KINDS_OF_FILES[0])  # fmt: skip
 """Formats of keypoints, which take files name; the most informative confidence first."""
 

@@ -25,12 +25,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError
-from kinefit.rows import AnyRows, DofRows, PairRows, ParameterRows, Rows, less_sure
 from kinefit.sensors import _kernels
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.scene import Scene, Unknown
 from kinefit.sensors.surfaces.depth_view import DepthSeen, DepthView
-from kinefit.solvers.pixels import PixelPoints
+from kinefit.solving.pixels import PixelPoints
+from kinefit.solving.rows import AnyRows, DofRows, PairRows, ParameterRows, Rows, less_sure
 
 
 def of_kind(value: object, kind: type, what: str, remedy: str, *, each: type | None = None) -> None:

@@ -14,8 +14,8 @@ from kinefit.errors import ObservationError, check_choice
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Keypoints
 from kinefit.observations.recordings import mirror_name
-from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.sensors.base import Matched
+from kinefit.solving.rows import AnyRows, DofRows, Rows
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.geometry import se3
-from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.sensors.base import Leftover, Matched, Measurement, leftovers_at, matched_by, rows_at
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.scene import Scene
+from kinefit.solving.rows import AnyRows, DofRows, Rows
 
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 """Names of the six values of a displacement: shift [m] of its centre, then the rotation vector [rad]."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, KinematicTree, PointSet
-from kinefit.motion import BELIEVED
+from kinefit.bodies.motion import BELIEVED
 from kinefit.sensors import _kernels
 
 # Of 260 lost part-frames of a rendered body, this and BELIEVED flag 99 % at 0.03 % false alarms; values of 0.2 to 0.3

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.morphs.morphing import MorphedPose, Morphing
-from kinefit.correspondences import targets
-from kinefit.correspondences.contours.morphed import on_moved_joints
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.rows import DofRows, Rows
 from kinefit.sensors.visibility.visibility import TrackedSurface
+from kinefit.solving.correspondences import targets
+from kinefit.solving.correspondences.contours.morphed import on_moved_joints
+from kinefit.solving.rows import DofRows, Rows
 
 SURFACE_SAMPLES = 600  # points of a body's surface that are compared with depth images
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from kinefit.geometry.losses import Loss, geman_mcclure
 from kinefit.images.regions import RegionSettings
-from kinefit.losses import Loss, geman_mcclure
 from kinefit.observations import KEYPOINT_SIGMA
 
 MARKER_LOSS = geman_mcclure(5.0)
@@ -79,7 +79,7 @@ class TrackSettings:
         `collision_rows`.
     skin_shift, skin_turn : float [m], [rad]
         Standard deviations of a surface's offset and rotation about its bone: where points constrain the body too, they
-        limit how well a surface constrains a joint; see `rows_of` in `kinefit.frame.fit`.
+        limit how well a surface constrains a joint; see `rows_of` in `kinefit.fitting.frame.fit`.
         Shift: with silhouettes of the balancing trial's first 30 frames, 0 left keypoints 1.25 times as far off as
         without silhouettes, 0.01 1.07 times, 0.02 1.02 times, on a trunk that lay 1 to 1.5 cm further forward than the
         catalogue's; on the catalogue's 0.02 leaves 1.03 times. Turn: not swept. 0 takes surfaces as exact.

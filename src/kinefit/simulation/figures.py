@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, MeshSurface
+from kinefit.bodies.motion import UP_AXES, Motion
+from kinefit.bodies.rendering.looks import side_colour
 from kinefit.bodies.surfaces import Surface
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry.camera import Camera
-from kinefit.motion import UP_AXES, Motion
-from kinefit.rendering.looks import side_colour
 from kinefit.simulation.retarget import known_motion
-from kinefit.solvers.mobility import closed_poses
+from kinefit.solving.mobility import closed_poses
 
 _MARGIN_SHARE = 0.04  # of the image, free around the landmarks
 _MIN_DISTANCE = 1.0  # [m]

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.motion import Motion, rotation_between_up
 from kinefit.errors import ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.motion import Motion, rotation_between_up
 from kinefit.observations import Keypoints
 from kinefit.observations.recordings import mirror_name
-from kinefit.readers.keypoint_sets import keypoint_names
+from kinefit.readers.landmarks.keypoint_sets import keypoint_names
 from kinefit.simulation.figures import look_at, sees
 
 _DISTORTION = np.array([-0.06, 0.03, 0.0004, -0.0003])

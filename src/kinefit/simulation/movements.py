@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, TaperedCylinder, load_body
+from kinefit.bodies.motion import Motion
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry import se3
-from kinefit.motion import Motion
 from kinefit.simulation.retarget import known_motion
 
 

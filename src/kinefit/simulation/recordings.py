@@ -15,9 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.motion import UP_AXES, Motion
 from kinefit.errors import ExportError, ObservationError, choices
+from kinefit.fitting.tracking.recording import Recording
+from kinefit.fitting.tracking.tracker import Tracker
+from kinefit.fitting.tracking.video import track
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.motion import UP_AXES, Motion
 from kinefit.observations import DepthFrame, Keypoints
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation.figures import draw_figure, in_front, places, write_video
@@ -27,9 +30,6 @@ from kinefit.simulation.rendering.scenes import COLOUR, STEREO, ColourSensor, Si
 from kinefit.simulation.rendering.scenes import room as room_around
 from kinefit.simulation.rendering.sensors import DEPTH_SENSORS, KINECT, DepthSensor, simulate_depth
 from kinefit.simulation.retarget import cut
-from kinefit.tracking.recording import Recording
-from kinefit.tracking.tracker import Tracker
-from kinefit.tracking.video import track
 
 SENSORS = (*DEPTH_SENSORS, "stereo", "colour", "keypoints")
 """Sensors that `write_recording` can simulate."""

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.motion import UP_AXES, Motion
 from kinefit.errors import ExportError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
-from kinefit.motion import UP_AXES, Motion
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 from kinefit.simulation.figures import draw_figure, look_at, places, write_video
 
 _SLOPE_COLOUR = (240, 232, 226)  # BGR

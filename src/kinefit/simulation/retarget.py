@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState, PointSet, load_body
-from kinefit.correspondences import point_rows, prediction_rows, prior_rows
+from kinefit.bodies.motion import Motion
 from kinefit.errors import BodyError, ObservationError, choices
 from kinefit.findings import FINDINGS, as_records
 from kinefit.geometry import se3
-from kinefit.motion import Motion
 from kinefit.observations import SkeletonMotion
 from kinefit.simulation.skeletons import BoneDirections, bone_directions, steps
-from kinefit.solvers.least_squares import Fit, levenberg_marquardt
+from kinefit.solving.correspondences import point_rows, prediction_rows, prior_rows
+from kinefit.solving.least_squares import Fit, levenberg_marquardt
 
 _TARGET_STD = 0.001  # [m]; small relative to a bone, so that priors determine only what targets do not
 _POSTURE_STD = 0.5  # [rad] of the angles about the default posture: determines the rotation of a straight arm

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.joint_names import SIDES, Recorded, recorded_joints
+from kinefit.bodies.motion import rotation_between_up
 from kinefit.errors import ObservationError
 from kinefit.findings import Finding
 from kinefit.geometry import se3
-from kinefit.motion import rotation_between_up
 from kinefit.observations import SkeletonMotion
 
 _MIN_BONE_LENGTH = 0.005  # [m]: a shorter bone has no direction

@@ -7,22 +7,22 @@ from os import PathLike
 
 from kinefit._arguments import checked
 from kinefit.bodies import load_body
-from kinefit.calibration.sensors import fit_sensors
-from kinefit.diagnostics.checks import CHECKS, Check, Checked, Progress, run
-from kinefit.diagnostics.depth import UNCHECKED, depth_findings
-from kinefit.diagnostics.images import finding_of
-from kinefit.diagnostics.quick import inverted_findings
-from kinefit.diagnostics.sensors import sensor_findings
 from kinefit.errors import KinefitError, command
 from kinefit.findings import Finding
-from kinefit.preparing.each_video import Tell
-from kinefit.preparing.take import warn
+from kinefit.fitting.subject.subject import Subject
+from kinefit.fitting.tracking.sizing import SizedPerson, sized_by_depth
+from kinefit.fitting.tracking.take_recording import label_findings_of, recording_of, sensors_of
 from kinefit.readers.take.cameras import is_alone
 from kinefit.readers.take.file import Take, read_take
-from kinefit.subject.subject import Subject
+from kinefit.rigs.diagnostics.checks import CHECKS, Check, Checked, Progress, run
+from kinefit.rigs.diagnostics.depth import UNCHECKED, depth_findings
+from kinefit.rigs.diagnostics.images import finding_of
+from kinefit.rigs.diagnostics.quick import inverted_findings
+from kinefit.rigs.sensors import fit_sensors
+from kinefit.sensors.alignment import sensor_findings
 from kinefit.takes.missing import prepared
-from kinefit.tracking.sizing import SizedPerson, sized_by_depth
-from kinefit.tracking.take_recording import label_findings_of, recording_of, sensors_of
+from kinefit.takes.preparing.each_video import Tell
+from kinefit.takes.preparing.take import warn
 
 
 @checked

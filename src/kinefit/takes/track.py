@@ -9,36 +9,36 @@ import numpy as np
 
 from kinefit._arguments import checked
 from kinefit.bodies import Body, load_body
-from kinefit.correspondences.bands import BAND, with_bands
-from kinefit.diagnostics.images import load_uncovered
-from kinefit.diagnostics.quick import input_findings, with_cause, with_findings
+from kinefit.bodies.motion import Motion
 from kinefit.errors import KinefitError, TakeError, command, located
-from kinefit.identification.take.takes import with_names
-from kinefit.motion import Motion
-from kinefit.readers.calibration.read import found_notes
-from kinefit.readers.motion import read_motion
-from kinefit.readers.take.checks import check_enough
-from kinefit.readers.take.file import Take, read_take
-from kinefit.readers.take.kinds import kinds_of, naming_plugins
-from kinefit.readers.take.load import Observations, load_observations
-from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.online.lag_frame import KnownNoise
-from kinefit.subject.keypoints import fit_subject
-from kinefit.subject.subject import Subject
-from kinefit.takes.in_view import InView, people_in_view
-from kinefit.takes.missing import prepared
-from kinefit.tracking.cameras import as_found
-from kinefit.tracking.checkpoints.checkpoint import Checkpoint, TrackingInterrupted
-from kinefit.tracking.recording import Recording
-from kinefit.tracking.sizing import channels_of
-from kinefit.tracking.take_recording import (
+from kinefit.fitting.smoothing.online.lag_frame import KnownNoise
+from kinefit.fitting.subject.keypoints import fit_subject
+from kinefit.fitting.subject.subject import Subject
+from kinefit.fitting.tracking.cameras import as_found
+from kinefit.fitting.tracking.checkpoints.checkpoint import Checkpoint, TrackingInterrupted
+from kinefit.fitting.tracking.recording import Recording
+from kinefit.fitting.tracking.sizing import channels_of
+from kinefit.fitting.tracking.take_recording import (
     label_findings_of,
     on_floor,
     recording_of,
     rig_on_floor,
     with_fitted_start,
 )
-from kinefit.tracking.video import Progress, track
+from kinefit.fitting.tracking.video import Progress, track
+from kinefit.markers.take.takes import with_names
+from kinefit.readers.calibration.read import found_notes
+from kinefit.readers.motion import read_motion
+from kinefit.readers.take.checks import check_enough
+from kinefit.readers.take.file import Take, read_take
+from kinefit.readers.take.kinds import kinds_of, naming_plugins
+from kinefit.readers.take.load import Observations, load_observations
+from kinefit.rigs.diagnostics.images import load_uncovered
+from kinefit.rigs.diagnostics.quick import input_findings, with_cause, with_findings
+from kinefit.sensors.settings import TrackSettings
+from kinefit.solving.correspondences.bands import BAND, with_bands
+from kinefit.takes.in_view import InView, people_in_view
+from kinefit.takes.missing import prepared
 
 _DEFAULT_BODY = "humanoid"  # body of a take that names none
 

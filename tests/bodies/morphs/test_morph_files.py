@@ -7,13 +7,13 @@ import pytest
 from tests.docs.blocks import blocks
 
 from kinefit.bodies import BodyState, load_body, parse_body, save_body
-from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.bodies.morphs.morph_files import format_morphs
 from kinefit.bodies.morphs.morphing import GlobalMorph, JointMotion, LocalMorph, Morphing, SegmentMorph
 from kinefit.bodies.morphs.operators import Steering
 from kinefit.bodies.parts import without_part
 from kinefit.bodies.serial import body_from_arrays, body_to_arrays
 from kinefit.bodies.surfaces import SkinnedMesh
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.errors import BodyError, ExportError
 
 OWN = """

@@ -5,14 +5,14 @@ import pytest
 from tests.oracle import random_body
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.bodies.morphs.morphing import GlobalMorph, JointMotion, LocalMorph, Morphing, radial_basis
 from kinefit.bodies.morphs.operators import WEIGHTS, Steering, weight_function
 from kinefit.bodies.surfaces import BodyMesh, SkinnedMesh
-from kinefit.correspondences.contours.morphed import morphed_rows
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry import cga, lines, se3
-from kinefit.solvers.least_squares import gauss_newton
+from kinefit.solving.correspondences.contours.morphed import morphed_rows
+from kinefit.solving.least_squares import gauss_newton
 
 random = np.random.default_rng(0)
 

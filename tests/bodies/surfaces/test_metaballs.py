@@ -7,14 +7,14 @@ import pytest
 from tests.oracle import central_differences, design
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.body_surfaces import SurfaceAnchors, nearest
 from kinefit.bodies.serial import save_body, saved_body
 from kinefit.bodies.surfaces import Metaballs
 from kinefit.bodies.surfaces.closest._kernels_metaballs import field
 from kinefit.bodies.surfaces.metaballs import pack_balls
-from kinefit.correspondences import surface_rows
+from kinefit.bodies.surfaces.places import SurfaceAnchors, nearest
 from kinefit.errors import BodyError
 from kinefit.geometry.se3 import exp_so3
+from kinefit.solving.correspondences import surface_rows
 
 CENTRES = [[0, -0.03, 0], [0.01, -0.14, 0], [0, -0.26, 0.005]]
 RADII = [[0.075, 0.11, 0.075], [0.08, 0.12, 0.07], [0.06, 0.1, 0.055]]
@@ -199,8 +199,8 @@ def test_body_files(tmp_path):
 def test_the_exported_limbs_are_closed(tmp_path):
     from benchmarks.surface_body import moving_arm
 
+    from kinefit.bodies.rendering.looks import body_mesh
     from kinefit.exporters import write_glb
-    from kinefit.rendering.looks import body_mesh
 
     motion = replace(moving_arm(0, 3), body=BODY)
     write_glb(motion, tmp_path / "arm.glb")

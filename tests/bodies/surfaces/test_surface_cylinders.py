@@ -11,9 +11,9 @@ from scipy.optimize import minimize
 from tests.oracle import random_unit
 
 from kinefit.bodies import BodyState, TaperedCylinder, load_body
-from kinefit.bodies.body_surfaces import nearest
 from kinefit.bodies.surfaces import bounding_box
 from kinefit.bodies.surfaces.closest._kernels_cylinder import nearest_on_cylinders, nearest_on_cylinders_exact
+from kinefit.bodies.surfaces.places import nearest
 from kinefit.bodies.surfaces.tables import tables
 from kinefit.errors import BodyError, KinefitError, ObservationError
 from kinefit.geometry import se3

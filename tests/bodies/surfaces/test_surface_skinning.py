@@ -7,10 +7,10 @@ import pytest
 from tests.oracle import central_differences, random_body, slow_motions, state_of
 
 from kinefit.bodies import load_body
-from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.parts import without_part
 from kinefit.bodies.surfaces import BodyMesh, SkinnedMesh
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.bodies.surfaces.skins.skinning import strongest
 from kinefit.errors import BodyError
 

@@ -8,8 +8,8 @@ from tests.bodies.surfaces.shapes import box
 from tests.oracle import STATES, state_of
 
 from kinefit.bodies import load_body
-from kinefit.bodies.body_surfaces import body_mesh, sample
 from kinefit.bodies.surfaces import MeshSurface, TaperedCylinder, triangles
+from kinefit.bodies.surfaces.places import body_mesh, sample
 from kinefit.errors import BodyError
 from kinefit.geometry import se3
 

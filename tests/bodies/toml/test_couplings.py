@@ -8,8 +8,8 @@ from kinefit.bodies.parts import PartJoint, with_part, without_part
 from kinefit.bodies.serial import body_from_arrays, body_to_arrays
 from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.bodies.toml.bodies import parse_body
-from kinefit.correspondences import prior_rows
 from kinefit.errors import BodyError
+from kinefit.solving.correspondences import prior_rows
 
 TWO_JOINTS = """
 [body]

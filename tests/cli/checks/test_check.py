@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from kinefit.batch.corrections import undo
 from kinefit.bodies import load_body
 from kinefit.cli.checks._refine import free_name
 from kinefit.cli.checks.check import check
-from kinefit.diagnostics.checks import Checked
 from kinefit.errors import ExportError, KinefitError, TakeError
 from kinefit.exporters.c3d_file import write_markers
 from kinefit.findings import Edit, Finding
@@ -19,8 +17,10 @@ from kinefit.geometry import se3
 from kinefit.observations import Markers
 from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.readers.take.file import read_take
+from kinefit.rigs.diagnostics.checks import Checked
 from kinefit.simulation import known_motion, movement, simulate_keypoints, studio_rig
 from kinefit.takes import check as checking
+from kinefit.takes.batch.corrections import undo
 
 
 def run(*args):

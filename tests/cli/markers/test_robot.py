@@ -3,7 +3,7 @@
 import pytest
 from benchmarks.markers_robot import learn, make_robot, single_frames, whole_take
 
-from kinefit.identification.model.model import load_model
+from kinefit.markers.model.model import load_model
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,10 @@ from tests.readers.skeletons.bvh_variants import any_frames, write_variant
 
 import kinefit
 from kinefit.bodies import load_body
+from kinefit.bodies.rendering.looks import person_skin
 from kinefit.cli import main
 from kinefit.exporters import write_bvh, write_motion
 from kinefit.readers.skeletons.bvh import read_bvh
-from kinefit.rendering.looks import person_skin
 from kinefit.simulation import cut, squat_and_wave
 
 
@@ -65,7 +65,7 @@ EXTRAS = {"nwb": "ndx_pose", "mcap": "mcap_ros2", "rrd": "rerun"}
 
 
 def test_every_choice_that_help_lists_is_one_of_the_exporter(file):
-    from kinefit.batch.results import FORMATS, OPTIONS
+    from kinefit.takes.batch.results import FORMATS, OPTIONS
 
     for format in FORMATS.built_in:
         for key in OPTIONS:

@@ -5,10 +5,10 @@ import pytest
 from click.testing import CliRunner
 
 import kinefit
+from kinefit.bodies.motion import rotation_between_up
 from kinefit.cli import main
 from kinefit.exporters import write_motion
 from kinefit.exporters.skeletons.common import NAMES
-from kinefit.motion import rotation_between_up
 from kinefit.simulation import cut, squat_and_wave
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from tests.photogrammetry import scenes
+from tests.images.photogrammetry import scenes
 
 from kinefit.cli.surfaces._measure import in_number_order
 from kinefit.cli.surfaces.surface import surface

@@ -3,8 +3,8 @@
 import pytest
 from click.testing import CliRunner
 
-from kinefit.batch.summary import FAILED, Row
 from kinefit.cli import main
+from kinefit.takes.batch.summary import FAILED, Row
 
 
 def run(*words):
@@ -23,7 +23,7 @@ def done(monkeypatch):
             progress(k + 1, 2, (row,))
         return rows
 
-    monkeypatch.setattr("kinefit.batch.many.track_takes", track_takes)
+    monkeypatch.setattr("kinefit.takes.batch.many.track_takes", track_takes)
     return asked
 
 
@@ -57,7 +57,7 @@ def test_ctrl_c_names_what_goes_on(take, tmp_path, monkeypatch):
     def stopped(*given, **more):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("kinefit.batch.many.track_takes", stopped)
+    monkeypatch.setattr("kinefit.takes.batch.many.track_takes", stopped)
     told = run(take, "--out", tmp_path / "out")
     assert told.exit_code == 130 and "run the same command to continue" in told.output
 

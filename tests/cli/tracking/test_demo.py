@@ -6,15 +6,15 @@ import pytest
 from click.testing import CliRunner
 
 import kinefit
-from kinefit import assets
 from kinefit.cli import main
 from kinefit.errors import AssetError, command
+from kinefit.readers import assets
 
 
 @pytest.fixture
 def no_overlays(monkeypatch):
     """Overlays are the slow part, and test_track.py sees to them."""
-    monkeypatch.setattr("kinefit.batch.one.write_overlays", lambda *args, **more: None)
+    monkeypatch.setattr("kinefit.takes.batch.one.write_overlays", lambda *args, **more: None)
 
 
 def run(*args):

@@ -14,20 +14,20 @@ from click.testing import CliRunner
 from tests.cli.stopping import STOPPABLE
 
 import kinefit
-from kinefit.batch.results import DEFAULT_FORMATS, FORMATS
 from kinefit.cli import main
 from kinefit.cli._summary import bone_lengths
 from kinefit.errors import ObservationError
 from kinefit.exporters.report.moments import doubt_sentence, doubtful_moments, when
 from kinefit.findings import frame_ranges
-from kinefit.preparing import faces
-from kinefit.readers.video import Video
+from kinefit.fitting.tracking.checkpoints.checkpoint import TrackingInterrupted
+from kinefit.fitting.tracking.recording import Recording
+from kinefit.fitting.tracking.video import track
+from kinefit.readers.videos.video import Video
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
-from kinefit.tracking.checkpoints.checkpoint import TrackingInterrupted
-from kinefit.tracking.recording import Recording
-from kinefit.tracking.video import track
+from kinefit.takes.batch.results import DEFAULT_FORMATS, FORMATS
+from kinefit.takes.preparing import faces
 
-HUMANOID = (resources.files("kinefit.bodies") / "catalogue" / "humanoid.toml").read_text(encoding="utf-8")
+HUMANOID = (resources.files("kinefit.bodies.toml") / "catalogue" / "humanoid.toml").read_text(encoding="utf-8")
 
 
 def run(*args):
@@ -302,7 +302,7 @@ def test_a_folder_in_whose_place_a_file_stands_is_told_at_once(take, tmp_path):
 def test_a_full_disk_leaves_only_whole_files(take, tmp_path):
     code = (
         "import resource, sys; from kinefit.cli import main\n"
-        "import kinefit.batch.one as r; write = r.write_overlays\n"
+        "import kinefit.takes.batch.one as r; write = r.write_overlays\n"
         "def limited(*a, **k):\n    resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000)); write(*a, **k)\n"
         "r.write_overlays = limited; main()"
     )
@@ -380,7 +380,7 @@ def test_ctrl_c_before_the_first_frame_is_only_that(monkeypatch):
     def interrupted(*args, **more):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("kinefit.tracking.tracker.Tracker.update", interrupted)
+    monkeypatch.setattr("kinefit.fitting.tracking.tracker.Tracker.update", interrupted)
     with pytest.raises(KeyboardInterrupt) as stopped:
         track(Recording.of_keypoints(rig, simulate_keypoints(motion, rig), up=motion.up), motion.body)
     assert not isinstance(stopped.value, TrackingInterrupted)
@@ -390,7 +390,7 @@ def test_ctrl_c_during_overlays_lists_what_is_whole(take, tmp_path, monkeypatch)
     def interrupted(*args, **more):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("kinefit.batch.one.write_overlays", interrupted)
+    monkeypatch.setattr("kinefit.takes.batch.one.write_overlays", interrupted)
     told = run("track", take, "--out", tmp_path / "out", "--formats", "bvh")
     assert told.exit_code == 130
     assert str(tmp_path / "out" / "motion.bvh") in told.stdout

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from tests.exporters.synthetic import a_camera, smooth_motion
 
+from kinefit.bodies.rendering.looks import LOST_COLOUR
 from kinefit.exporters.pictures.overlay import depth_picture
-from kinefit.rendering.looks import LOST_COLOUR
 
 
 def test_outlines_are_white_and_those_of_lost_segments_dashed_and_grey():

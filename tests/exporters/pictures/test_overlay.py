@@ -10,13 +10,13 @@ from tests.exporters.synthetic import a_camera, smooth_motion
 
 from kinefit.bodies import load_body
 from kinefit.bodies.limbs import finger_groups
+from kinefit.bodies.rendering.looks import CENTRE_COLOUR, LEFT_COLOUR, LOST_COLOUR, RIGHT_COLOUR
 from kinefit.errors import ExportError
 from kinefit.exporters import draw_overlay, write_montage, write_overlay
 from kinefit.exporters.pictures.drawing import bones
 from kinefit.exporters.pictures.overlay import frames_of
 from kinefit.geometry.camera import ImageFrame
-from kinefit.readers.video import Video
-from kinefit.rendering.looks import CENTRE_COLOUR, LEFT_COLOUR, LOST_COLOUR, RIGHT_COLOUR
+from kinefit.readers.videos.video import Video
 from kinefit.simulation import cut
 
 CAMERA = a_camera("cam 0", 0.3)

@@ -10,10 +10,10 @@ import pytest
 from tests.exporters.synthetic import smooth_motion
 
 from kinefit.bodies import load_body
+from kinefit.bodies.motion import rotation_between_up
+from kinefit.bodies.rendering.looks import body_mesh, side_colour, to_hex
 from kinefit.exporters.report.figure import MAX_FIGURE_FRAMES, figure, live_figure
 from kinefit.geometry import se3
-from kinefit.motion import rotation_between_up
-from kinefit.rendering.looks import body_mesh, side_colour, to_hex
 
 
 @pytest.fixture(scope="module")

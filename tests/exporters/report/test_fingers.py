@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
+from kinefit.bodies.motion import Residuals
 from kinefit.exporters.report.angles import by_joint, ranges_of
 from kinefit.exporters.report.moments import doubtful_moments, plain, throughout_sentence
 from kinefit.exporters.tables import curves, spoken
 from kinefit.geometry import se3
-from kinefit.motion import Residuals
 from kinefit.simulation import known_motion
 
 F = 60

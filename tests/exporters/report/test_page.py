@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kinefit import assets
 from kinefit.errors import AssetError, ExportError
 from kinefit.exporters.report import page as p
+from kinefit.readers import assets
 
 
 def own(text):

@@ -7,10 +7,10 @@ import pytest
 from tests.exporters.report.test_page import own
 from tests.exporters.synthetic import smooth_motion
 
+from kinefit.bodies.lasting_errors import LastingErrors, ParameterErrors
+from kinefit.bodies.motion import BRIEF_S
 from kinefit.exporters.report.angles import MAX_STD_DEG, all_ranges, extremes, range_changes, ranges_of, ranges_table
 from kinefit.exporters.tables import NAMES, Curve, curves
-from kinefit.lasting_errors import LastingErrors, ParameterErrors
-from kinefit.motion import BRIEF_S
 
 RATE = 50.0
 TIMES = np.arange(101) / RATE

@@ -11,6 +11,7 @@ from tests.exporters.report.test_page import own, plots
 from tests.exporters.synthetic import a_camera, smooth_motion
 
 from kinefit.bodies import load_body
+from kinefit.bodies.motion import Residuals, rotation_between_up
 from kinefit.errors import ExportError
 from kinefit.exporters.report.fit import overall_median, sensor_fits
 from kinefit.exporters.report.flagged import close_up, report_frames
@@ -29,7 +30,6 @@ from kinefit.exporters.tables import curves
 from kinefit.findings import listed, runs_of
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Residuals, rotation_between_up
 from kinefit.simulation import cut, known_motion
 
 F = 80

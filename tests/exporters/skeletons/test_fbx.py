@@ -16,10 +16,10 @@ from tests.exporters.synthetic import smooth_motion
 from tests.exporters.test_options import METRES, same
 
 from kinefit.bodies import load_body
+from kinefit.bodies.rendering.looks import body_mesh
 from kinefit.errors import ExportError
 from kinefit.exporters import write_fbx
 from kinefit.exporters.skeletons.common import NAMES, bone_names
-from kinefit.rendering.looks import body_mesh
 
 HERE = Path(__file__).parent
 CLOSE = 1e-4  # [m]

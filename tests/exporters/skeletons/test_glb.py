@@ -9,9 +9,9 @@ import pytest
 from tests.exporters.synthetic import smooth_motion
 
 from kinefit.bodies import load_body
+from kinefit.bodies.rendering.looks import body_mesh
 from kinefit.errors import ExportError
 from kinefit.exporters import write_glb
-from kinefit.rendering.looks import body_mesh
 
 
 class Glb:

@@ -6,11 +6,11 @@ from tests.exporters.synthetic import smooth_motion
 from tests.exporters.test_options import bvh_positions, glb_positions, same
 
 from kinefit.bodies import load_body
+from kinefit.bodies.rendering.looks import body_mesh
 from kinefit.errors import ExportError
 from kinefit.exporters import write_bvh, write_glb, write_usd
 from kinefit.exporters.skeletons.common import rest_pose
 from kinefit.readers.skeletons.bvh import read_bvh
-from kinefit.rendering.looks import body_mesh
 
 
 @pytest.fixture(scope="module")

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from kinefit import assets
 from kinefit.errors import AssetError
 from kinefit.images.detectors.faces import FaceDetector, head_circles, parts
-from kinefit.readers.video import Video
+from kinefit.readers import assets
+from kinefit.readers.videos.video import Video
 
 
 @pytest.mark.parametrize("size", [(1920, 1080), (1080, 1920), (640, 480), (300, 200), (3840, 2160)])

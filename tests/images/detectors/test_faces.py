@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinefit import assets
 from kinefit.errors import AssetError
 from kinefit.images.detectors.box_detector import Models
 from kinefit.images.detectors.detection import PersonDetection, detect_people
 from kinefit.images.detectors.faces import FaceFinder, FaceLandmarks, FaceModels, around_face, around_head
 from kinefit.images.detectors.roi import Roi
-from kinefit.readers.video import Video
+from kinefit.readers import assets
+from kinefit.readers.videos.video import Video
 
 IMAGE = np.zeros((480, 640, 3), np.uint8)
 MESH = np.random.default_rng(2).uniform(-0.5, 0.5, (478, 2)) * [0.8, 1.0]  # of a face 1 px high, upright

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinefit import assets
 from kinefit.errors import AssetError
 from kinefit.images.detectors.box_detector import Models
 from kinefit.images.detectors.detection import PersonDetection, detect_people
@@ -18,7 +17,8 @@ from kinefit.images.detectors.faces import (
     around_wrist,
 )
 from kinefit.images.detectors.roi import Roi
-from kinefit.readers.video import Video
+from kinefit.readers import assets
+from kinefit.readers.videos.video import Video
 
 RNG = np.random.default_rng(3)
 FINGERS = np.column_stack([RNG.uniform(-10, 10, 21), RNG.uniform(-40, 0, 21)])  # upwards from the wrist [px]

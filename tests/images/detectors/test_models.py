@@ -25,8 +25,8 @@ def test_a_missing_network_is_told(tmp_path):
 
 
 def test_a_network_of_other_inputs_and_outputs_is_told():
-    from kinefit import assets
     from kinefit.errors import AssetError
+    from kinefit.readers import assets
 
     try:
         folder = assets.detector_models()

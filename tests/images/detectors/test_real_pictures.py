@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from kinefit import assets
 from kinefit.errors import AssetError
 from kinefit.images.detectors.box_detector import Models
 from kinefit.images.detectors.detection import detect_people
-from kinefit.readers.video import Video
+from kinefit.readers import assets
+from kinefit.readers.videos.video import Video
 
 pytestmark = pytest.mark.network
 

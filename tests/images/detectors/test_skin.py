@@ -6,7 +6,7 @@ import pytest
 
 from kinefit.errors import ObservationError
 from kinefit.images.detectors.skin import WRISTS, SkinTracker
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 from kinefit.sensors.visibility.occlusion import MIN_VISIBLE_CONFIDENCE
 
 SKIN, WOOD, WALL, SHIRT = (205, 150, 125), (190, 140, 110), (130, 150, 140), (40, 60, 120)

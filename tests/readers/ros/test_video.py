@@ -5,7 +5,7 @@ import pytest
 from benchmarks.bags import START, Bag
 
 from kinefit.errors import FileError, ObservationError
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 
 pytest.importorskip("rosbags.rosbag2")
 pytest.importorskip("mcap_ros2")

@@ -7,9 +7,9 @@ from kinefit import Markers
 from kinefit.bodies import load_body
 from kinefit.errors import ObservationError
 from kinefit.exporters import write_markers
+from kinefit.fitting.tracking.take_recording import recording_of
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.tracking.take_recording import recording_of
 
 
 def write_take(path, text, **clock):

@@ -7,11 +7,11 @@ from tests.sensors.region_scenes import CAMERA, RIG, image, off, state, thing
 
 from kinefit.bodies import BodyState
 from kinefit.errors import TakeError
+from kinefit.fitting.tracking.take_recording import recording_of
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.takes.track import track_take
-from kinefit.tracking.take_recording import recording_of
 
 
 def written(folder, *, region='[[region]]\ncamera = "cam"\n', start=True, scale=1, count=4):

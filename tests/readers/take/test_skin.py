@@ -7,9 +7,9 @@ import pytest
 
 from kinefit.bodies import load_body
 from kinefit.errors import KinefitError, TakeError
+from kinefit.fitting.tracking.take_recording import recording_of
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.tracking.take_recording import recording_of
 
 SKIN, WALL, SHIRT = (205, 150, 125), (130, 150, 140), (40, 60, 120)
 LEFT, RIGHT = np.array([220, 150]), np.array([100, 150])

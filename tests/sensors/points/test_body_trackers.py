@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.fitting.tracking.movements import BODY, RATE, STILL, a_motion
 from tests.oracle import STATES, central_differences, state_of
-from tests.tracking.movements import BODY, RATE, STILL, a_motion
 
 from kinefit import BodyTrackerFrame, Recording, Tracker, load_body, track
 from kinefit.errors import BodyError, ObservationError

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kinefit.geometry.camera import Rig
-from kinefit.losses import geman_mcclure
+from kinefit.geometry.losses import geman_mcclure
 from kinefit.observations import KeypointFrame
 from kinefit.sensors.points.keypoints import KeypointSensor
 from kinefit.sensors.scene import Scene

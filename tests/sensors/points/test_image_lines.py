@@ -7,15 +7,15 @@ import pytest
 
 from kinefit.bodies import BodyState, load_body, parse_body
 from kinefit.errors import BodyError, CalibrationError, ObservationError
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.losses import SQUARED, geman_mcclure
+from kinefit.geometry.losses import SQUARED, geman_mcclure
 from kinefit.observations import LineFrame
-from kinefit.rows import DofRows
 from kinefit.sensors.points.image_lines import ImageLineSensor, image_lines
 from kinefit.sensors.scene import Scene
-from kinefit.solvers.equations import normal_equations
-from kinefit.solvers.least_squares import gauss_newton
-from kinefit.tracking.tracker import Tracker
+from kinefit.solving.equations import normal_equations
+from kinefit.solving.least_squares import gauss_newton
+from kinefit.solving.rows import DofRows
 
 CORNERS = dict(zip("abcdefgh", product((0.0, 0.6), (0.0, 0.4), (0.0, 0.3))))
 EDGES = {m + n: (m, n) for m in CORNERS for n in CORNERS if m < n and np.sum(np.array(CORNERS[m]) != CORNERS[n]) == 1}

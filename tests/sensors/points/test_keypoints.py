@@ -4,17 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.fitting.tracking.movements import BODY, SET, a_motion, a_rig, keypoint_frame, marker_frame, turned
 from tests.oracle import central_differences, design
-from tests.tracking.movements import BODY, SET, a_motion, a_rig, keypoint_frame, marker_frame, turned
 
 from kinefit.errors import BodyError, CalibrationError
-from kinefit.losses import geman_mcclure
+from kinefit.geometry.losses import geman_mcclure
 from kinefit.observations import KeypointFrame
 from kinefit.sensors.points.keypoints import KeypointSensor
 from kinefit.sensors.points.markers import MarkerSensor
 from kinefit.sensors.scene import Scene
-from kinefit.solvers.equations import normal_equations
-from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
+from kinefit.solving.equations import normal_equations
+from kinefit.solving.least_squares import gauss_newton, levenberg_marquardt
 
 TRUTH = a_motion().state(0)
 WRONG = turned(TRUTH, arm_add_l=-12)

@@ -10,10 +10,10 @@ from tests.sensors.scenes import posture, ring
 from kinefit.bodies import load_body
 from kinefit.errors import BodyError, CalibrationError, ObservationError
 from kinefit.observations import Keypoints, LiftedFrame
-from kinefit.rows import PairRows
 from kinefit.sensors.channels import known_points
 from kinefit.sensors.points.lifted import HIPS, LiftedSensor, person_size
 from kinefit.sensors.scene import Scene
+from kinefit.solving.rows import PairRows
 
 BODY, SET = load_body("humanoid"), "MEDIAPIPE_33"
 POINTS = known_points(BODY, SET)

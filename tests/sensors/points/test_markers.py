@@ -4,19 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.tracking.movements import BODY, a_motion, a_rig, marker_frame, turned
+from tests.fitting.tracking.movements import BODY, a_motion, a_rig, marker_frame, turned
 
 from kinefit.bodies import PointSet
 from kinefit.errors import BodyError, ObservationError
-from kinefit.frame.routing import Sensors
-from kinefit.losses import geman_mcclure
+from kinefit.fitting.frame.routing import Sensors
+from kinefit.fitting.tracking.recording import Recording
+from kinefit.geometry.losses import geman_mcclure
 from kinefit.observations import MarkerFrame
 from kinefit.sensors.evidence import MIN_VISIBLE_OUTLINE
 from kinefit.sensors.points.markers import MarkerSensor, of_points
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.solvers.least_squares import gauss_newton
-from kinefit.tracking.recording import Recording
+from kinefit.solving.least_squares import gauss_newton
 
 TRUTH = a_motion().state(0)
 SCENE = Scene(BODY, TRUTH, a_rig())

@@ -4,14 +4,14 @@
 import numpy as np
 
 from kinefit.bodies import load_body
-from kinefit.losses import geman_mcclure
+from kinefit.fitting.tracking.recording import Recording
+from kinefit.fitting.tracking.video import track
+from kinefit.geometry.losses import geman_mcclure
 from kinefit.sensors.channels import make_channels
 from kinefit.sensors.points.keypoints import KeypointMeasurement, KeypointSensor, Layout, projected
 from kinefit.sensors.points.views import MIRRORED, TERMS, ViewBias, directions, trunks, view_offset
 from kinefit.sensors.scene import Scene
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
-from kinefit.tracking.recording import Recording
-from kinefit.tracking.video import track
 
 BODY = load_body("humanoid")
 MOTION = squat_and_wave(rate=20.0, duration=2.0)

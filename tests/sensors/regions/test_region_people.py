@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from tests.sensors.painted_people import BODY, RIG, WALL, frames, image, person
 
+from kinefit.bodies.rendering import render_body
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry.camera import Rig
 from kinefit.images.regions import RegionSettings
 from kinefit.observations import ColourFrame
-from kinefit.rendering import render_body
 from kinefit.sensors.regions.region_parts import AROUND, Parts
 from kinefit.sensors.regions.regions import RegionSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.tracker import Tracker
 
 FRONT = RIG["front"]
 SEGMENT = {name: k for k, name in enumerate(BODY.tree.segments)}

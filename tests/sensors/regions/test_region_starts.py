@@ -6,16 +6,16 @@ from tests.oracle import central_differences
 from tests.sensors.region_arm import CAMERA, RIG, arm, frame, state
 
 from kinefit.bodies import PointSet
-from kinefit.frame.trust import angles_off_prediction
+from kinefit.bodies.rendering import render_body
+from kinefit.fitting.frame.trust import angles_off_prediction
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.observations import DepthFrame
-from kinefit.rendering import render_body
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.regions.region_parts import Limbs, Seams
 from kinefit.sensors.regions.region_search import Flips
 from kinefit.sensors.regions.regions import RegionSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.tracker import Tracker
 
 TRUTH = state(0.3, 0.4, -0.9)
 SCENE = Scene(arm(), TRUTH, RIG)

@@ -9,6 +9,7 @@ from tests.sensors.region_scenes import CAMERA, RIG, frame, image, off, state, t
 
 from kinefit.bodies import load_body
 from kinefit.errors import ObservationError
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.regions import RegionSettings
 from kinefit.observations import ColourFrame
@@ -17,7 +18,6 @@ from kinefit.sensors.regions.region_parts import spread_anchors
 from kinefit.sensors.regions.regions import RegionSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.tracker import Tracker
 
 BODY, TRUTH = thing(), state()
 SCENE = Scene(BODY, TRUTH, RIG)

@@ -8,18 +8,18 @@ import pytest
 from tests.sensors.scenes import at, posture, ring
 
 from kinefit.bodies import BodyState, load_body
+from kinefit.bodies.motion import Motion
+from kinefit.bodies.rendering import render_body
 from kinefit.errors import ObservationError
 from kinefit.exporters import write_motion
+from kinefit.fitting.initialization.from_silhouettes import LEVELS, coarse_to_fine
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry.camera import Rig
 from kinefit.images.silhouette import outline
-from kinefit.initialization.from_silhouettes import LEVELS, coarse_to_fine
-from kinefit.motion import Motion
 from kinefit.observations import KeypointFrame, SilhouetteFrame
-from kinefit.rendering import render_body
 from kinefit.sensors.regions.silhouette import averaged
 from kinefit.sensors.settings import TrackSettings
 from kinefit.takes.track import track_take
-from kinefit.tracking.tracker import Tracker
 
 
 @pytest.fixture(scope="module")

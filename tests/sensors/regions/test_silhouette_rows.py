@@ -10,16 +10,16 @@ from tests.sensors.surfaces.test_depth_image import apart, softened
 
 from kinefit.bodies import load_body
 from kinefit.bodies.morphs.morphing import Morphing
-from kinefit.correspondences.contours.outlines import outline_pairs, outline_rows
+from kinefit.bodies.rendering import Canvas, render_body
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SilhouetteFrame
-from kinefit.rendering import Canvas, render_body
-from kinefit.rows import DofRows
 from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.solvers.least_squares import gauss_newton
+from kinefit.solving.correspondences.contours.outlines import outline_pairs, outline_rows
+from kinefit.solving.least_squares import gauss_newton
+from kinefit.solving.rows import DofRows
 
 SETTINGS, RIG = TrackSettings(), ring()
 BODY = load_body("humanoid")

@@ -5,26 +5,26 @@ from functools import cache
 
 import numpy as np
 import pytest
+from tests.fitting.tracking.movements import BODY, SENSOR, a_motion, a_rig, images, turned
 from tests.oracle import central_differences, design
 from tests.sensors.scenes import at, ring
-from tests.tracking.movements import BODY, SENSOR, a_motion, a_rig, images, turned
 
 from kinefit.bodies import load_body
 from kinefit.bodies.morphs.morphing import JointMotion, Morphing
 from kinefit.bodies.morphs.operators import Steering
-from kinefit.correspondences import depth_image_rows, free_space_rows, surface_rows
-from kinefit.correspondences.occupancy.free_space import FreeSpace
+from kinefit.bodies.rendering import Canvas, render_body
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame
-from kinefit.rendering import Canvas, render_body
-from kinefit.rows import DofRows
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surfaces.depth_image import DepthImageSensor
 from kinefit.sensors.surfaces.depth_view import Background
-from kinefit.solvers.equations import normal_equations
-from kinefit.solvers.least_squares import gauss_newton
+from kinefit.solving.correspondences import depth_image_rows, free_space_rows, surface_rows
+from kinefit.solving.correspondences.occupancy.free_space import FreeSpace
+from kinefit.solving.equations import normal_equations
+from kinefit.solving.least_squares import gauss_newton
+from kinefit.solving.rows import DofRows
 
 TRUTH, SETTINGS, WALL = a_motion().state(0), TrackSettings(), 4.0
 WRONG = turned(TRUTH, arm_add_l=-12, hip_flexion_r=8).retract(np.array([0.03, 0.02, -0.03] + [0.0] * 22))

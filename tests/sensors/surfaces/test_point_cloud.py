@@ -4,21 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.fitting.tracking.movements import BODY, cloud_frame, turned
 from tests.oracle import central_differences, design
 from tests.sensors.scenes import at, ring
 from tests.sensors.surfaces.test_depth_image import SETTINGS, TRUTH, apart, found, moving, scene
-from tests.tracking.movements import BODY, cloud_frame, turned
 
 from kinefit.bodies import load_body
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.parts import with_part
 from kinefit.bodies.surfaces import MeshSurface
-from kinefit.correspondences import surface_rows
 from kinefit.errors import BodyError
 from kinefit.observations import PointCloud
-from kinefit.rows import DofRows
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
+from kinefit.solving.correspondences import surface_rows
+from kinefit.solving.rows import DofRows
 
 WRONG = turned(TRUTH, arm_add_l=-12)
 

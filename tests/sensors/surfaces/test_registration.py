@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
-from kinefit.calibration.sensors import fit_sensors
 from kinefit.cli.checks._refine import Refined, write_refined
-from kinefit.diagnostics.sensors import misfits, moved_cameras, sensor_findings
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
+from kinefit.rigs.sensors import fit_sensors
+from kinefit.sensors.alignment import misfits, moved_cameras, sensor_findings
 from kinefit.simulation import (
     DepthSensor,
     in_front,

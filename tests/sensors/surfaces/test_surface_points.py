@@ -7,14 +7,14 @@ from tests.sensors.scenes import at, posture
 
 from kinefit import observations
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.body_surfaces import sample
+from kinefit.bodies.surfaces.places import sample
 from kinefit.errors import ObservationError
+from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SurfacePointFrame
 from kinefit.sensors.kinds.surface_points import SurfacePointRecording
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.surface_points import SurfacePointSensor
-from kinefit.tracking.tracker import Tracker
 
 BODY = load_body("humanoid")
 POINTS, NORMALS, SEGMENT = sample(BODY, 300)

@@ -7,8 +7,8 @@ import pytest
 
 from kinefit.bodies import load_body
 from kinefit.bodies.limbs import of_fingers
+from kinefit.bodies.rendering import Canvas, render_body
 from kinefit.geometry.camera import Camera
-from kinefit.rendering import Canvas, render_body
 from kinefit.sensors.visibility.visibility import Layers, judge_segments
 
 BODY = load_body("humanoid")

@@ -3,12 +3,12 @@
 
 import numpy as np
 import pytest
-from tests.tracking.movements import BODY, a_motion, a_rig, a_tracker
+from tests.fitting.tracking.movements import BODY, a_motion, a_rig, a_tracker
 
+from kinefit.bodies.rendering import render_body
 from kinefit.geometry.camera import Rig
-from kinefit.losses import geman_mcclure
+from kinefit.geometry.losses import geman_mcclure
 from kinefit.observations import DepthFrame, KeypointFrame
-from kinefit.rendering import render_body
 from kinefit.sensors.points.keypoints import KeypointMeasurement, KeypointSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -20,7 +20,7 @@ from kinefit.sensors.visibility.occlusion import (
     depth_behind,
     hidden_points,
 )
-from kinefit.solvers.equations import normal_equations
+from kinefit.solving.equations import normal_equations
 
 TRUTH = a_motion().state(0)
 CAMERA = a_rig()["depth"]

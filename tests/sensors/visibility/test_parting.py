@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.tracking.depth_oracle import BODY, camera, facing
+from tests.fitting.tracking.depth_oracle import BODY, camera, facing
 
+from kinefit.bodies.rendering import render_body
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, SilhouetteFrame
-from kinefit.rendering import render_body
 from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
+from kinefit.bodies.rendering import render_body
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
-from kinefit.rendering import render_body
 from kinefit.sensors.visibility import _kernels_visibility as kernels
 from kinefit.sensors.visibility.visibility import Layers, SegmentVerdict, judge_segments
 

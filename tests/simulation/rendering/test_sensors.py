@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
+from kinefit.bodies.motion import UP_AXES
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
-from kinefit.motion import UP_AXES
 from kinefit.simulation import (
     COLOUR,
     KINECT,

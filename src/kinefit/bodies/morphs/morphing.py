@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.bodies.morphs.operators import (
     GlobalMorph,
     JointMotion,
@@ -26,6 +25,7 @@ from kinefit.bodies.morphs.operators import (
     radial_basis,
 )
 from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
 from kinefit.bodies.surfaces.triangles import BodyMesh, triangles

@@ -60,13 +60,13 @@ def _text(name_or_file: str | Path) -> tuple[str, str]:
         return read_text(path, "the body file", remedy=remedy, error=BodyError), str(path)
     name, remedy = str(name_or_file), "A body file of your own is given by its path, ending in .toml."
     check_choice("body in the catalogue named", name, catalogue(), BodyError, remedy=remedy)
-    entry = resources.files("kinefit.bodies") / "catalogue" / f"{name}.toml"
+    entry = resources.files("kinefit.bodies.toml") / "catalogue" / f"{name}.toml"
     return entry.read_text(encoding="utf-8"), f"catalogue body {name}"
 
 
 def catalogue() -> tuple[str, ...]:
     """Names of the bodies that come with kinefit."""
-    folder = resources.files("kinefit.bodies") / "catalogue"
+    folder = resources.files("kinefit.bodies.toml") / "catalogue"
     return tuple(sorted(e.name[:-5] for e in folder.iterdir() if e.name.endswith(".toml")))
 
 

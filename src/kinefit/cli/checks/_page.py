@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.diagnostics.checks import Checked
-from kinefit.diagnostics.views import from_others
+from kinefit.bodies.motion import UP_AXES
 from kinefit.errors import KinefitError
 from kinefit.exporters.pictures.drawing import DARK, MEASURED, draw_dot, draw_line
 from kinefit.exporters.report import page as p
+from kinefit.fitting.multiview.views import from_others
 from kinefit.geometry.camera import Camera, ImageFrame
-from kinefit.motion import UP_AXES
-from kinefit.preparing.faces import shown_video
+from kinefit.rigs.diagnostics.checks import Checked
+from kinefit.takes.preparing.faces import shown_video
 
 if TYPE_CHECKING:
     from kinefit.cli.checks._refine import Refined

@@ -7,21 +7,21 @@ from pathlib import Path
 from typing import Any
 
 from kinefit._files import write_text
-from kinefit.batch.results import Step
 from kinefit.bodies import load_body
-from kinefit.calibration.refine.refine import refine
-from kinefit.calibration.refine.result import Refinement
-from kinefit.calibration.sensors import fit_sensors
 from kinefit.cli import _screen
-from kinefit.diagnostics.checks import Checked
-from kinefit.diagnostics.sensors import SensorAlignment, alignment_line, marker_edits, misfits, moved_cameras
 from kinefit.errors import CalibrationError, FileError, TakeError, command
 from kinefit.exporters.take_text import edited, quoted
 from kinefit.findings import Edit, in_words
 from kinefit.geometry.camera import Rig
-from kinefit.readers.annotations import read_static_points
 from kinefit.readers.calibration.write import write_calibration_like
+from kinefit.readers.landmarks.annotations import read_static_points
 from kinefit.readers.take.file import read_take
+from kinefit.rigs.diagnostics.checks import Checked
+from kinefit.rigs.refine.refine import refine
+from kinefit.rigs.refine.result import Refinement
+from kinefit.rigs.sensors import fit_sensors
+from kinefit.sensors.alignment import SensorAlignment, alignment_line, marker_edits, misfits, moved_cameras
+from kinefit.takes.batch.results import Step
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,10 @@ import click
 from kinefit.cli import _screen
 
 if TYPE_CHECKING:
-    from kinefit.batch.results import Step
     from kinefit.cli.checks._refine import Refined
-    from kinefit.diagnostics.checks import Checked
     from kinefit.findings import Edit
+    from kinefit.rigs.diagnostics.checks import Checked
+    from kinefit.takes.batch.results import Step
 
 _EXAMPLES = """\b
 Examples:
@@ -56,13 +56,13 @@ def check(
     if points is not None and not points.is_file():
         raise click.BadParameter(f"no such file: {points}", param_hint="--points")
     from kinefit._files import write_text
-    from kinefit.batch.corrections import write_edits
     from kinefit.cli._screen import check_file
     from kinefit.cli.checks._page import check_page
     from kinefit.cli.checks._refine import refined_of, write_refined
     from kinefit.errors import KinefitError
     from kinefit.findings import as_records, fixes, in_words, ranked
     from kinefit.readers.take.file import find_take
+    from kinefit.takes.batch.corrections import write_edits
 
     take = find_take(take, wanted=("check",))
     out = out or take.with_name(f"{take.stem}-check.html")

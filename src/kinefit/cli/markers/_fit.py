@@ -11,31 +11,31 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kinefit.batch.results import FORMATS, check_formats, description, write_results
 from kinefit.bodies import Body, PointSet, load_body
 from kinefit.bodies.marker_sets import bare, find_marker_set, load_marker_set, matched, read_sides
+from kinefit.bodies.motion import Motion, rotation_between_up
 from kinefit.cli import _screen
 from kinefit.cli._screen import Step, check_file, note
 from kinefit.errors import KinefitError, ObservationError, located
 from kinefit.exporters.skeletons.common import plain_names
 from kinefit.findings import FINDINGS, Finding, as_records, faults_of
-from kinefit.identification.model.from_frame import model_from_frame
-from kinefit.identification.model.gate import TrainingFinding, training_gate
-from kinefit.identification.model.learn import learn_model
-from kinefit.identification.model.model import MarkerModel, load_model
-from kinefit.identification.take.takes import (
+from kinefit.fitting.markers.subject import MarkerSubject
+from kinefit.markers.model.from_frame import model_from_frame
+from kinefit.markers.model.gate import TrainingFinding, training_gate
+from kinefit.markers.model.learn import learn_model
+from kinefit.markers.model.model import MarkerModel, load_model
+from kinefit.markers.take.takes import (
     TakeIdentification,
     TakeSettings,
     identify_people,
     identify_take,
     one_after_the_other,
 )
-from kinefit.markers.subject import MarkerSubject
-from kinefit.motion import Motion, rotation_between_up
 from kinefit.observations import Markers
+from kinefit.takes.batch.results import FORMATS, check_formats, description, write_results
 
 if TYPE_CHECKING:
-    from kinefit.markers.first_set import FirstSet
+    from kinefit.fitting.markers.first_set import FirstSet
 
 
 def read_file(path: str | PathLike[str], unit: str | None) -> Markers:
@@ -97,7 +97,7 @@ def write_first_set(
         A file cannot be read or written, or shows too little.
     """
     from kinefit._files import write_text
-    from kinefit.markers.first_set import first_set
+    from kinefit.fitting.markers.first_set import first_set
 
     markers = one_after_the_other([read_file(path, unit) for path in paths])
     found = first_set(markers, body=load_body("humanoid"), name=name or Path(out).stem.upper())
@@ -198,8 +198,8 @@ def _doubts(found: dict[str, TakeIdentification], markers: Markers, many: bool) 
 
 def check_labels(markers: Markers, marker_set: str | None) -> list[Finding]:
     """Check sides and labels of every person of a take on the humanoid, where it has the labels (`label_findings`)."""
-    from kinefit.markers.poses import split_people
-    from kinefit.markers.sides import label_findings
+    from kinefit.fitting.markers.poses import split_people
+    from kinefit.fitting.markers.sides import label_findings
 
     found: list[Finding] = []
     for person in split_people(markers).values():
@@ -267,12 +267,12 @@ def fit_file(
         A file cannot be read or written, too few labels are known, no frame shows enough (see `fit_markers`), or left
         and right are wrong (see `label_findings`).
     """
-    from kinefit.diagnostics.quick import motion_findings
     from kinefit.exporters import write_markers, write_osim, write_trc
     from kinefit.exporters.report.report import write_report
-    from kinefit.markers.sides import label_findings, refuse_wrong_sides
-    from kinefit.markers.subject import fit_marker_subject
-    from kinefit.tracking.markers import fit_markers
+    from kinefit.fitting.markers.sides import label_findings, refuse_wrong_sides
+    from kinefit.fitting.markers.subject import fit_marker_subject
+    from kinefit.fitting.tracking.markers import fit_markers
+    from kinefit.rigs.diagnostics.quick import motion_findings
 
     step, formats, options = step or (lambda what, done, total: None), tuple(formats), options or MarkerFitOptions()
     folder = out if out is not None else path.with_name(f"{path.stem}-kinefit")
@@ -352,7 +352,7 @@ def worn_body(subject: MarkerSubject, labels: Iterable[str]) -> Body:
 
 def read_people(file: Path, unit: str | None, sides: str | None = None) -> dict[str, Markers]:
     """The people of a file, by the prefix of their labels, with left and right as `sides` states (see `read_sides`)."""
-    from kinefit.markers.poses import split_people
+    from kinefit.fitting.markers.poses import split_people
 
     markers = read_file(file, unit)
     if sides:

@@ -13,7 +13,7 @@ from kinefit.cli._screen import CommandGroup
 
 if TYPE_CHECKING:
     from kinefit.findings import Finding
-    from kinefit.identification.take.takes import TakeIdentification
+    from kinefit.markers.take.takes import TakeIdentification
     from kinefit.observations import Markers
 
 MOST_DOUBTS = 12
@@ -56,7 +56,7 @@ def learn(
 ) -> None:  # fmt: skip
     """Learn a subject's markers from labelled takes, best from a take in which every joint moves."""
     from kinefit.cli.markers._fit import learn_files
-    from kinefit.identification.model.model import save_model
+    from kinefit.markers.model.model import save_model
 
     if no_set and (marker_set or frame is not None):
         raise click.UsageError("--no-set learns from the motion alone: leave out --set and --frame.")
@@ -139,8 +139,8 @@ def identify(
     ignored. Points without a certain label stay unlabelled. The worst doubtful frames are printed; a table lists all.
     """
     from kinefit.cli.markers._fit import identify_file
-    from kinefit.identification.take.takes import TakeSettings, identify_take
-    from kinefit.recipes.unlabelled_markers import sapm_take
+    from kinefit.markers.take.takes import TakeSettings, identify_take
+    from kinefit.papers.unlabelled_markers import sapm_take
 
     given = (("epsilon", epsilon), ("beta", beta))
     constants: dict[str, Any] = {name: value for name, value in given if value is not None}
@@ -252,8 +252,8 @@ def audit(
     """Find swapped labels, exchanged sides, a mirrored world, and markers off their segment, in labelled takes."""
     from kinefit.bodies.marker_sets import load_marker_set
     from kinefit.cli.markers._fit import check_labels, read_file
-    from kinefit.identification.audit.audit import audit_take
-    from kinefit.identification.model.model import load_model
+    from kinefit.markers.audit.audit import audit_take
+    from kinefit.markers.model.model import load_model
 
     model = load_model(subject) if subject else None
     known = load_marker_set(marker_set) if marker_set else None

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kinefit.batch.results import FORMATS, OPTIONS, description, write_format
 from kinefit.cli import _screen
 from kinefit.errors import spelled
+from kinefit.takes.batch.results import FORMATS, OPTIONS, description, write_format
 
 if TYPE_CHECKING:
-    from kinefit.evaluation.voodoo import Summary
-    from kinefit.motion import Motion
+    from kinefit.bodies.motion import Motion
     from kinefit.observations.recordings import SkeletonMotion
+    from kinefit.simulation.evaluation.voodoo import Summary
 
 NAMES = tuple(name for name in FORMATS.names() if name != "motion")
 """Formats into which a motion file can be written."""
@@ -284,9 +284,9 @@ def evaluate(
     Grade 2: the mean joint error is at most 60 mm, and no joint is off by more than 150 mm in over 5 % of the frames.
     Grade 0: a joint is off by more than 250 mm at the end, or in most of the frames.
     """
-    from kinefit.evaluation.sequences import sequences
-    from kinefit.evaluation.voodoo import METHODS, conclusions, found_start
-    from kinefit.evaluation.voodoo import evaluate as run_all
+    from kinefit.simulation.evaluation.sequences import sequences
+    from kinefit.simulation.evaluation.voodoo import METHODS, conclusions, found_start
+    from kinefit.simulation.evaluation.voodoo import evaluate as run_all
     from kinefit.simulation.rendering.sensors import DEPTH_SENSORS
 
     runs = sequences(count, sensor=DEPTH_SENSORS[sensor], rate=rate, seed=seed)

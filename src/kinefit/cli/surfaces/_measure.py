@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from kinefit._files import regular
 from kinefit._pictures import read_picture
+from kinefit.bodies.motion import Motion
 from kinefit.errors import CalibrationError, FileError, ObservationError, TrackingError, shortened
 from kinefit.exporters.surface_files import (
     point_columns,
@@ -29,20 +30,19 @@ from kinefit.exporters.surface_files import (
     write_velocity_picture,
 )
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.motion import Motion
+from kinefit.images.photogrammetry.flat import measure_flat
+from kinefit.images.photogrammetry.least_squares_matching import windows_by_texture
+from kinefit.images.photogrammetry.region_growing import MIN_CORRELATION, Grid, Seeds
+from kinefit.images.photogrammetry.spline_image import SplineImage, grey
+from kinefit.images.photogrammetry.states import measure_states, rigid_motion, surface_strain
+from kinefit.images.photogrammetry.surface import MeasuredSurface
+from kinefit.images.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
+from kinefit.images.photogrammetry.trajectories import Trajectories, filtered
 from kinefit.observations.clocks import is_even
-from kinefit.photogrammetry.flat import measure_flat
-from kinefit.photogrammetry.least_squares_matching import windows_by_texture
-from kinefit.photogrammetry.region_growing import MIN_CORRELATION, Grid, Seeds
-from kinefit.photogrammetry.spline_image import SplineImage, grey
-from kinefit.photogrammetry.states import measure_states, rigid_motion, surface_strain
-from kinefit.photogrammetry.surface import MeasuredSurface
-from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
-from kinefit.photogrammetry.trajectories import Trajectories, filtered
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.depth.images import natural
 from kinefit.readers.motion import read_motion
-from kinefit.readers.video import Video, images_in
+from kinefit.readers.videos.video import Video, images_in
 
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 

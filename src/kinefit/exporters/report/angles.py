@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
+from kinefit.bodies.lasting_errors import common
+from kinefit.bodies.motion import Motion
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.cycles import PERCENT, Cycles, Norms, normalised
 from kinefit.exporters.tables import DIGITS, FINGER_JOINTS, NAMES, Curve, curves, spoken
-from kinefit.lasting_errors import common
-from kinefit.motion import Motion
 
 _COLOURS = {"left": p.LEFT_COLOUR, "right": p.RIGHT_COLOUR, "": p.CENTRE_COLOUR}
 _GREY = "#8a949e"

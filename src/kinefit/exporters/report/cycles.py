@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import read_table
+from kinefit.bodies.motion import Motion
 from kinefit.errors import FileError
 from kinefit.exporters.report.feet import MIN_STRIDE_S, Feet, foot_events, peaks, smoothed
 from kinefit.exporters.report.strides import Quantity, stride_quantities
-from kinefit.motion import Motion
 from kinefit.observations import MarkerEvent
 
 PERCENT = np.arange(101.0)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.motion import Motion, rotation_between_up
+from kinefit.bodies.motion import Motion, rotation_between_up
 
 LEAST_STEP = 0.12  # share of the stature that a foot travels to and fro at least: shuffling 20 cm strides of an adult
 MIN_STRIDE_S = 0.4  # [s]: sprinters take 0.45 s

@@ -9,13 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, MeshSurface, PointSet
-from kinefit.bodies.surfaces import Surface
-from kinefit.exporters.pictures.drawing import bones
-from kinefit.exporters.report.page import Html, to_json
-from kinefit.geometry import se3
-from kinefit.geometry.camera import Rig
-from kinefit.motion import Motion, rotation_between_up
-from kinefit.rendering.looks import (
+from kinefit.bodies.motion import Motion, rotation_between_up
+from kinefit.bodies.rendering.looks import (
     LOST_COLOUR,
     LOST_OPACITY,
     UNCERTAIN_OPACITY,
@@ -26,6 +21,11 @@ from kinefit.rendering.looks import (
     triangle_segments,
     uncertain_segments,
 )
+from kinefit.bodies.surfaces import Surface
+from kinefit.exporters.pictures.drawing import bones
+from kinefit.exporters.report.page import Html, to_json
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Rig
 
 RATE = 15.0  # [Hz] of the figure: enough for the eye to follow, the player goes smoothly between
 MAX_FIGURE_FRAMES = 3000  # frames: longer takes are shown at a lower rate

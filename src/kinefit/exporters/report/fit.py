@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.motion import SHOWN_UNITS, Motion, Residuals, known_median
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.moments import POORLY_SUPPORTED, Moment
 from kinefit.findings import runs_of
-from kinefit.motion import SHOWN_UNITS, Motion, Residuals, known_median
 
 _SHIFTED = 0.5  # of the median residual: a constant shift above makes up most of what a camera is off by
 

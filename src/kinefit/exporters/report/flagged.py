@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.motion import Motion, Residuals
 from kinefit.exporters.pictures.drawing import draw_body, draw_residuals, drawn_points
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.moments import (
@@ -17,7 +18,6 @@ from kinefit.exporters.report.moments import (
     spoken_segments,
 )
 from kinefit.geometry.camera import Camera, ImageFrame
-from kinefit.motion import Motion, Residuals
 
 Pictures = Mapping[str, Mapping[int, NDArray[np.uint8]]]
 

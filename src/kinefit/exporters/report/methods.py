@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from kinefit.bodies import Body
+from kinefit.bodies.motion import SHOWN_UNITS, Motion
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.fit import overall_median, sensor_fits
 from kinefit.exporters.tables import split_side
 from kinefit.findings import listed
-from kinefit.motion import SHOWN_UNITS, Motion
 from kinefit.readers.plugins import KEYPOINTS
 
 _LIFTED = "lifted "  # before a camera's name: its own landmarks in 3D, by a network, and no other sensor

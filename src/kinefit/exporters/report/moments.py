@@ -11,9 +11,9 @@ from scipy.special import gammaincc
 
 from kinefit.bodies import Body
 from kinefit.bodies.limbs import finger_groups
+from kinefit.bodies.motion import Motion, Residuals
 from kinefit.exporters.tables import DIGITS, split_side
 from kinefit.findings import listed, runs_of
-from kinefit.motion import Motion, Residuals
 
 DOUBT_DISTANCE_M = 0.05  # [m] from the truth: about half as thick as a limb, which then lies beside itself
 _DOUBTFUL = 0.5  # probability that an end is farther off, above which a segment is doubtful

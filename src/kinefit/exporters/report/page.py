@@ -2,8 +2,8 @@
 
 A page is made of parts of type `Html`; plain text is escaped wherever it is given. A rule in the head of the page (its
 content security policy) forbids the browser to load anything from elsewhere. Plots are drawn by plotly.js, which is put
-in once, compressed, and only where there is a plot. `kinefit.assets` fetches it before the first page with a plot; a
-page that is written where it cannot be fetched says so and has no plots.
+in once, compressed, and only where there is a plot. `kinefit.readers.assets` fetches it before the first page with a
+plot; a page that is written where it cannot be fetched says so and has no plots.
 
     text = page("Balancing", [
         section("Quality", paragraph("All frames were tracked."), plot([{"x": times, "y": quality}])),
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+import hashlib
 import json
 import math
 import re
@@ -29,10 +30,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit.bodies.rendering import looks
 from kinefit.errors import AssetError, ExportError
 from kinefit.findings import Finding
-from kinefit.rendering import looks
-from kinefit.serving.access import inline_policy
 
 # Left and right as in overlays.
 LEFT_COLOUR, RIGHT_COLOUR = looks.to_hex(looks.LEFT_COLOUR), looks.to_hex(looks.RIGHT_COLOUR)
@@ -333,7 +333,7 @@ def _shades() -> str:
 @lru_cache(maxsize=1)
 def _plotly() -> tuple[str, str]:
     """plotly.js, and compressed, 2 MB where it has 5; the page unpacks it. Why it cannot be had, and ""."""
-    from kinefit.assets import PLOTLY_PACKAGE, fetch
+    from kinefit.readers.assets import PLOTLY_PACKAGE, fetch
 
     try:
         script = (fetch(PLOTLY_PACKAGE) / "plotly.min.js").read_bytes()
@@ -431,3 +431,20 @@ def thinned(values: NDArray, most: int = MAX_CURVE_POINTS) -> NDArray:
 
 def _axes(row: int) -> dict[str, str]:
     return {"xaxis": "x", "yaxis": f"y{row + 1}" if row else "y"}
+
+
+def inline_policy(scripts: Iterable[str], styles: Iterable[str], more: str = "") -> str:
+    """A policy under which a page runs exactly these inline scripts and styles, by their hashes, and fetches nothing.
+
+    Parameters
+    ----------
+    scripts, styles : texts of the elements, to the letter
+    more : further directives, such as "img-src data:"
+    """
+    hashes = [" ".join(_hash(text) for text in texts) or "'none'" for texts in (scripts, styles)]
+    rules = ["default-src 'none'", f"script-src {hashes[0]}", f"style-src {hashes[1]}"]
+    return "; ".join([*rules, *([more] if more else []), "base-uri 'none'", "form-action 'none'"])
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

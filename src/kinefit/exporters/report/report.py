@@ -18,6 +18,7 @@ import numpy as np
 
 from kinefit._arguments import checked
 from kinefit._files import write_text
+from kinefit.bodies.motion import Motion
 from kinefit.errors import ExportError, choices
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.angles import (
@@ -49,7 +50,6 @@ from kinefit.exporters.report.strides import Quantity
 from kinefit.exporters.tables import curves, spoken
 from kinefit.findings import listed, of_provenance
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Motion
 
 _BUDGET = 40  # pictures at 640 px: about 3 MB; more of them are made smaller
 

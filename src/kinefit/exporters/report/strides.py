@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import PointSet
+from kinefit.bodies.motion import BRIEF_S, Motion, rotation_between_up
 from kinefit.exporters.report.feet import BALL, HEEL, Feet, FootEvents
-from kinefit.motion import BRIEF_S, Motion, rotation_between_up
 
 _QUANTITIES = (
     "stride time [s]", "cadence [steps/min]", "stance [% of cycle]", "swing [% of cycle]",

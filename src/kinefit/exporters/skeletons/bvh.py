@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit._files import write_lines
 from kinefit.bodies import Body
+from kinefit.bodies.motion import Motion
 from kinefit.errors import ExportError
 from kinefit.exporters.skeletons.common import (
     UNITS,
@@ -28,7 +29,6 @@ from kinefit.exporters.skeletons.common import (
     rest_pose,
     standing,
 )
-from kinefit.motion import Motion
 
 _ROTATIONS = "Zrotation Xrotation Yrotation"
 _POSITIONS = "Xposition Yposition Zposition"

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body
 from kinefit.bodies.joint_names import CHARACTER_BONES, segment_names
+from kinefit.bodies.motion import UP_AXES, Motion, continuous_quaternions, rotation_between_up
+from kinefit.bodies.rendering.looks import TubeMesh
 from kinefit.errors import ExportError, check_choice, spelled
 from kinefit.geometry import se3
-from kinefit.motion import UP_AXES, Motion, continuous_quaternions, rotation_between_up
-from kinefit.rendering.looks import TubeMesh
 
 NAMES = ("kinefit", "bvh", "mixamo", "cmu", "opensim", "hanim", *CHARACTER_BONES)
 """Conventions of names: the body's own, its aliases, those of characters in game engines."""

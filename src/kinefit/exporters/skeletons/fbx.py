@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit._files import writing
 from kinefit.bodies import Body
+from kinefit.bodies.motion import Motion
+from kinefit.bodies.rendering.looks import TubeMesh, body_mesh
 from kinefit.exporters.skeletons.common import (
     UNITS,
     Rest,
@@ -33,8 +35,6 @@ from kinefit.exporters.skeletons.common import (
     turned,
     turning_segments,
 )
-from kinefit.motion import Motion
-from kinefit.rendering.looks import TubeMesh, body_mesh
 
 TICKS_PER_S = 46_186_158_000
 """Unit of time of FBX, KTime, in a second."""

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit._files import write_bytes, writing
 from kinefit.bodies import Body, MeshSurface
+from kinefit.bodies.motion import Motion
+from kinefit.bodies.rendering.looks import TubeMesh, body_mesh
 from kinefit.bodies.surfaces import Surface
 from kinefit.errors import ExportError, extra
 from kinefit.exporters.skeletons.common import (
@@ -31,8 +33,6 @@ from kinefit.exporters.skeletons.common import (
     turned,
     turning_segments,
 )
-from kinefit.motion import Motion
-from kinefit.rendering.looks import TubeMesh, body_mesh
 
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _COMPONENTS = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}

@@ -23,12 +23,12 @@ from kinefit._arguments import checked
 from kinefit._files import write_bytes, write_lines
 from kinefit.bodies import Body
 from kinefit.bodies.joint_names import DIGITS, FINGERS, SIDES, humanoid_segments, joint_map
+from kinefit.bodies.motion import Motion, continuous_quaternions
 from kinefit.errors import BodyError, ExportError, FileError
 from kinefit.exporters.skeletons.bvh import bvh_motion
 from kinefit.exporters.skeletons.common import euler
 from kinefit.exporters.skeletons.glb import GltfFile
 from kinefit.geometry import se3
-from kinefit.motion import Motion, continuous_quaternions
 from kinefit.readers.skeletons.characters import KINDS, Character, read_character
 
 # Bones whose direction is kept, with the segment that each leads to.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from kinefit.errors import CalibrationError, FileError, KinefitError, ObservationError, extra, names_file
 from kinefit.geometry.camera import Camera
 from kinefit.readers.depth.images import DepthSource
-from kinefit.readers.video_files import open_container
+from kinefit.readers.videos.video_files import open_container
 
 # Depth modes of the Azure Kinect: size [px] -> (width of the binned sensor, offset of the crop) [px]; source: Azure
 # Kinect Sensor SDK, mode_specific_calibration.c.

@@ -21,8 +21,8 @@ from kinefit.readers.guess.names import HOW, Trial, trials
 from kinefit.readers.guess.views import keypoint_entries, keypoint_sources, read_sources
 from kinefit.readers.take.cameras import DEFAULT_FIELD_OF_VIEW
 from kinefit.readers.take.checks import ONE_CAMERA
-from kinefit.readers.video import Video, common_frames
-from kinefit.readers.video_files import stated_time_code
+from kinefit.readers.videos.video import Video, common_frames
+from kinefit.readers.videos.video_files import stated_time_code
 
 UNSTATED = 1.0  # [Hz] of files without a rate, until the user states it
 _MIN_SPREAD = 0.2  # [m] of the cameras from their centre: a desk

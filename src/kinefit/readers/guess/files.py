@@ -23,11 +23,11 @@ from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, SUFFI
 from kinefit.readers.depth.images import PICTURES, natural, npy_source, picture_source
 from kinefit.readers.depth.streams import has_depth_track
 from kinefit.readers.guess.names import camera_of
-from kinefit.readers.keypoint_sets import SPLIT, other_keypoints
-from kinefit.readers.keypoints import decode_openpose, read_keypoints
+from kinefit.readers.landmarks.keypoint_sets import SPLIT, other_keypoints
+from kinefit.readers.landmarks.keypoints import decode_openpose, read_keypoints
 from kinefit.readers.plugins import CALIBRATIONS, KEYPOINTS, MARKERS
 from kinefit.readers.ros.recordings import inside
-from kinefit.readers.video import ENDINGS, ImageFolder, Video
+from kinefit.readers.videos.video import ENDINGS, ImageFolder, Video
 
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts", ".m2ts", ".ts", ".wmv", ".mxf"}
 OF_CALIBRATION = re.compile(

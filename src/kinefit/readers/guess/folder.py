@@ -24,7 +24,7 @@ from kinefit.readers.markers import read_markers
 from kinefit.readers.ros.images import Shown, mcap_rig, shown
 from kinefit.readers.take.entries import TABLES
 from kinefit.readers.take.kinds import KINDS, Proposal
-from kinefit.readers.video import ENDINGS
+from kinefit.readers.videos.video import ENDINGS
 
 _CALIBRATE = (
     "Calibrate with a board (kinefit calibrate board) or, if the cameras' intrinsics are known, from the person "

@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import LENGTHS
+from kinefit.bodies.motion import UP_AXES
 from kinefit.errors import KinefitError, ObservationError
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.geometry.lines import triangulate_robust
-from kinefit.motion import UP_AXES
 from kinefit.observations import Keypoints
 from kinefit.readers.guess.draft import Draft, Value
 from kinefit.readers.guess.files import STATIC, KeypointFile
 from kinefit.readers.guess.names import Trial, camera_number, common_words, trials
-from kinefit.readers.keypoint_sets import HAND_POINTS, OPENPOSE_HANDS, SET_OF_COUNT, SETS_WITH_HANDS
-from kinefit.readers.keypoints import read_keypoints
+from kinefit.readers.landmarks.keypoint_sets import HAND_POINTS, OPENPOSE_HANDS, SET_OF_COUNT, SETS_WITH_HANDS
+from kinefit.readers.landmarks.keypoints import read_keypoints
 from kinefit.readers.plugins import KEYPOINTS
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 
 Size = tuple[int, int]
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import LENGTHS, read_text, worth
+from kinefit.bodies.motion import UP_AXES
 from kinefit.errors import FileError, check_choice
-from kinefit.motion import UP_AXES
 
 
 def text_of(path: str | PathLike[str], kind: str) -> str:

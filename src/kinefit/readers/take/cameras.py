@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.motion import UP_AXES
 from kinefit.errors import CalibrationError, TakeError, choices
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
-from kinefit.motion import UP_AXES
 from kinefit.readers.calibration.read import found_notes, read_calibration
 from kinefit.readers.take.entries import CameraEntry, Take
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 
 DEFAULT_FIELD_OF_VIEW = 64.0
 """[deg] across the longer side of the image by default: videos of telephones have some 60 to 70."""

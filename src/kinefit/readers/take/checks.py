@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from kinefit._files import repeated
+from kinefit.bodies.motion import UP_AXES
 from kinefit.errors import FileError, ObservationError, TakeError, choices, command
-from kinefit.motion import UP_AXES
 from kinefit.observations.recordings import PersonChoice
 from kinefit.readers.depth.images import listed
-from kinefit.readers.keypoint_sets import FACE_SET
+from kinefit.readers.landmarks.keypoint_sets import FACE_SET
 from kinefit.readers.plugins import KEYPOINTS
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.entries import NO_FILES, SINGLE_TABLES, Take, keys_of

@@ -6,7 +6,7 @@ import numpy as np
 
 from kinefit.errors import TakeError, choices
 from kinefit.observations import ClickVideo
-from kinefit.readers.annotations import read_clicks
+from kinefit.readers.landmarks.annotations import read_clicks
 from kinefit.readers.take.cameras import TakeCameras, stated_rate
 
 _CLICK_CROSS_PX = 20.0  # from a click to the ends of the two lines that cross there: short, that no lens bends them

@@ -22,7 +22,7 @@ from kinefit._files import LENGTHS, worth
 from kinefit.errors import choices, located
 from kinefit.geometry import se3
 from kinefit.observations import KEYPOINT_SIGMA
-from kinefit.readers.keypoint_sets import FACE_SET, KEYPOINT_SETS, MEDIAPIPE_SETS
+from kinefit.readers.landmarks.keypoint_sets import FACE_SET, KEYPOINT_SETS, MEDIAPIPE_SETS
 from kinefit.readers.plugins import KEYPOINTS
 from kinefit.readers.take.kinds import KINDS, TakeEntry, refuse
 

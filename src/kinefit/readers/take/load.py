@@ -29,9 +29,9 @@ from kinefit.observations import (
 )
 from kinefit.observations.clocks import frame_times, is_even, on_steps
 from kinefit.readers.calibration.read import found_notes
-from kinefit.readers.detections import detections_file, read_detections
-from kinefit.readers.keypoint_sets import FACE_SET
-from kinefit.readers.keypoints import read_keypoints
+from kinefit.readers.landmarks.detections import detections_file, read_detections
+from kinefit.readers.landmarks.keypoint_sets import FACE_SET
+from kinefit.readers.landmarks.keypoints import read_keypoints
 from kinefit.readers.markers import read_markers
 from kinefit.readers.take.cameras import (
     TakeCameras,
@@ -58,7 +58,7 @@ from kinefit.readers.take.entries import (
 )
 from kinefit.readers.take.kinds import KINDS, SensorKind
 from kinefit.readers.take.skin import load_skin
-from kinefit.readers.video import Video, common_frames
+from kinefit.readers.videos.video import Video, common_frames
 
 _MIN_COMMON_FRAMES = 10  # without a calibration: fewer tell neither clocks nor places of cameras
 _LEVEL = 45.0  # [deg] turned by less, the axis of a marker file that was vertical still is the nearest to it

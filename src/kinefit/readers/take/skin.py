@@ -9,10 +9,10 @@ from kinefit.errors import TakeError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.images.detectors.skin import LANDMARKS, WRISTS, SkinTracker, face_box
 from kinefit.observations import KeypointVideo
-from kinefit.readers.detections import detections_file, read_detections
+from kinefit.readers.landmarks.detections import detections_file, read_detections
 from kinefit.readers.take.cameras import TakeCameras
 from kinefit.readers.take.entries import KeypointsEntry, Take
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 
 _NAMES = {"HANDS": LANDMARKS, "WRISTS": WRISTS}
 

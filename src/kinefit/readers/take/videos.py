@@ -15,7 +15,7 @@ from kinefit.observations import DepthVideo
 from kinefit.readers.take.entries import StereoEntry
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 
 _TYPICAL = 0.67  # share of the range at which a standard deviation of disparity becomes one of depth
 

@@ -21,11 +21,11 @@ from kinefit.images.silhouette import BackgroundPlate, colour_mask
 from kinefit.observations import ColourVideo, Detections, SilhouetteVideo
 from kinefit.observations.clocks import NamedFrames, frame_times, frames_by_name, is_even, nominal_rate
 from kinefit.readers.depth.images import listed
-from kinefit.readers.detections import detections_file, read_detections
+from kinefit.readers.landmarks.detections import detections_file, read_detections
 from kinefit.readers.take.cameras import TakeCameras, stated_frame, stated_rate
 from kinefit.readers.take.entries import Pixels, Rate
 from kinefit.readers.take.kinds import SensorKind, TakeEntry, refuse
-from kinefit.readers.video import Video
+from kinefit.readers.videos.video import Video
 
 _SIDE = 1000  # [px] of an image that its background is taken from: larger ones are made smaller by a whole number
 _LEARNT = 30  # images of a video from which its background is learnt

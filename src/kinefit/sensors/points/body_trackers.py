@@ -18,15 +18,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import check_shape
 from kinefit.bodies import Body, PointSet
-from kinefit.correspondences import _kernels
 from kinefit.errors import BodyError, ObservationError, check_choice, choices
 from kinefit.geometry import se3
-from kinefit.losses import Loss
+from kinefit.geometry.losses import Loss
 from kinefit.observations import BodyTrackerFrame
-from kinefit.rows import AnyRows, DofRows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor, Unknown, of_kind
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import MARKER_LOSS, TrackSettings
+from kinefit.solving.correspondences import _kernels
+from kinefit.solving.rows import AnyRows, DofRows
 
 _REFERENCE_DISTANCE_M = TrackSettings.near  # [m] correspondence distance at which the loss holds as it is
 _LEVER = 0.1  # [m] of the points that show an orientation to a start

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
-from kinefit.correspondences import _kernels
 from kinefit.geometry.camera import Camera
-from kinefit.losses import SQUARED, Loss
+from kinefit.geometry.losses import SQUARED, Loss
 from kinefit.observations import LineFrame
-from kinefit.rows import AnyRows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.scene import Scene
+from kinefit.solving.correspondences import _kernels
+from kinefit.solving.rows import AnyRows
 
 
 class ImageLineSensor(Sensor):

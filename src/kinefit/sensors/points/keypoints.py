@@ -11,13 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
-from kinefit.correspondences import _kernels
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.lines import triangulate_robust
-from kinefit.losses import Loss
+from kinefit.geometry.losses import Loss
 from kinefit.observations import KEYPOINTS, KeypointFrame, Keypoints
-from kinefit.rows import AnyRows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.channels import Channels, known_points, make_channels
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence, moves_points
@@ -34,7 +32,9 @@ from kinefit.sensors.points.views import (
 )
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.visibility.occlusion import MIN_VISIBLE_CONFIDENCE, Hidden, hidden_points
-from kinefit.solvers.pixels import PixelPoints
+from kinefit.solving.correspondences import _kernels
+from kinefit.solving.pixels import PixelPoints
+from kinefit.solving.rows import AnyRows
 
 Stream = tuple[str, str, tuple[str, ...]]
 """Camera, keypoint set and names of the keypoints that one detector gives frame after frame."""

@@ -19,11 +19,11 @@ from kinefit.bodies import Body, PointSet
 from kinefit.bodies.limbs import rigid_pairs
 from kinefit.geometry.lines import placed
 from kinefit.observations import Keypoints, LiftedFrame
-from kinefit.rows import AnyRows, PairRows
 from kinefit.sensors.base import Hints, Matched, Measurement, Sensor
 from kinefit.sensors.channels import known_points
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.scene import Scene
+from kinefit.solving.rows import AnyRows, PairRows
 
 HIPS = "left_hip", "right_hip"
 """The landmarks from whose middle a network counts."""

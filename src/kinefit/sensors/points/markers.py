@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
-from kinefit.correspondences import _kernels
-from kinefit.losses import Loss
+from kinefit.geometry.losses import Loss
 from kinefit.observations import MarkerFrame
-from kinefit.rows import AnyRows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.scene import Scene
+from kinefit.solving.correspondences import _kernels
+from kinefit.solving.rows import AnyRows
 
 _AT_JOINT = 0.05  # [m] from a joint: such a point is evidence for the segments on both sides of it
 

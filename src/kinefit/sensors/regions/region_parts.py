@@ -13,17 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.rendering import Canvas
 from kinefit.bodies.surfaces import BodyMesh, SkinnedMesh, TaperedCylinder
 from kinefit.bodies.tree import KinematicTree
-from kinefit.correspondences.contours.rims import Rim, RimFinder, Window
 from kinefit.geometry.camera import Camera
+from kinefit.geometry.losses import Loss
 from kinefit.images import _kernels_regions as kernels
 from kinefit.images.regions import Ratios
-from kinefit.losses import Loss
-from kinefit.rendering import Canvas
-from kinefit.rows import DofRows
 from kinefit.sensors.regions import _kernels_region_seams as seam_kernels
 from kinefit.sensors.scene import Scene
+from kinefit.solving.correspondences.contours.rims import Rim, RimFinder, Window
+from kinefit.solving.rows import DofRows
 
 _MAX_LEVEL = 127  # of a stored log ratio, to either side of 0
 # A stored band is an image whose colours are the numbers of levels, so that one kernel reads both.

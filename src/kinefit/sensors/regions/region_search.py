@@ -16,21 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.motion import BELIEVED
+from kinefit.bodies.rendering import MIN_Z
 from kinefit.bodies.surfaces import segment_middles
-from kinefit.correspondences import point_rows
-from kinefit.correspondences.points import prediction_rows
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.images import _kernels_regions as kernels
 from kinefit.images.regions import SearchSettings
-from kinefit.motion import BELIEVED
-from kinefit.rendering import MIN_Z
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.regions.region_parts import Coloured, Limbs
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.solvers.equations import inverse
-from kinefit.solvers.least_squares import levenberg_marquardt
+from kinefit.solving.correspondences import point_rows
+from kinefit.solving.correspondences.points import prediction_rows
+from kinefit.solving.equations import inverse
+from kinefit.solving.least_squares import levenberg_marquardt
 
 _MERGE_CELLS = 14  # of a grid about the body in which vertices are merged: two cells of the map each
 _SIGMA_DECAY = 0.6  # of the samples, from round to round

@@ -17,22 +17,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.correspondences.contours.morphed import morphed_outline_rows
-from kinefit.correspondences.contours.outlines import outline_rows
-from kinefit.correspondences.contours.rims import Rim
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
+from kinefit.geometry.losses import Loss, geman_mcclure
 from kinefit.images import _kernels_regions as kernels
 from kinefit.images.regions import Ratios, RegionColours, colour_bins
-from kinefit.losses import Loss, geman_mcclure
 from kinefit.observations import ColourFrame
-from kinefit.rows import AnyRows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.regions.region_parts import OTHER, SEAM_SPACING_PX, Coloured, Drawn, Lines, Parts, Seams, kept
 from kinefit.sensors.regions.region_search import Starts
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.solving.correspondences.contours.morphed import morphed_outline_rows
+from kinefit.solving.correspondences.contours.outlines import outline_rows
+from kinefit.solving.correspondences.contours.rims import Rim
+from kinefit.solving.rows import AnyRows
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,21 +11,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.correspondences.contours.morphed import morphed_outline_rows
-from kinefit.correspondences.contours.outlines import outline_pairs, outline_rows
-from kinefit.correspondences.contours.rims import Rim
+from kinefit.bodies.rendering import scaled
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
+from kinefit.geometry.losses import Loss, geman_mcclure
 from kinefit.images.silhouette import choose_person, outline
-from kinefit.losses import Loss, geman_mcclure
 from kinefit.observations import SilhouetteFrame
-from kinefit.rendering import scaled
-from kinefit.rows import AnyRows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.visibility.occlusion import drawn_together, outside_others
+from kinefit.solving.correspondences.contours.morphed import morphed_outline_rows
+from kinefit.solving.correspondences.contours.outlines import outline_pairs, outline_rows
+from kinefit.solving.correspondences.contours.rims import Rim
+from kinefit.solving.rows import AnyRows
 
 _MAX_RENDER_SHIFT_PX = 0.5  # of a body since its rendering: half of the offset at which pixels at the contour are read
 _FOREARM_RADIUS = 0.04  # [m]: a contour farther off is another part's, however poor the masks are

@@ -8,10 +8,10 @@ import numpy as np
 
 from kinefit._jit import jit
 from kinefit.bodies._kernels import forward
-from kinefit.correspondences.occupancy._kernels_space import capsule_gaps
+from kinefit.bodies.rendering._kernels import rasterise
 from kinefit.geometry._kernels_camera import ROT, TRANS
 from kinefit.geometry._kernels_frames import moved
-from kinefit.rendering._kernels import rasterise
+from kinefit.solving.correspondences.occupancy._kernels_space import capsule_gaps
 
 
 @jit

@@ -10,13 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
-from kinefit.correspondences import depth_image_rows, surface_rows
-from kinefit.correspondences.occupancy.free_space import FreeSpace
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.images.depth import without_speckles
 from kinefit.observations import DepthFrame
-from kinefit.rows import AnyRows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor, by_segments
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, Evidence
 from kinefit.sensors.scene import Scene
@@ -26,6 +23,9 @@ from kinefit.sensors.surfaces.depth_view import Background, DepthSeen, DepthView
 from kinefit.sensors.surfaces.point_cloud import FreePairs, SurfacePairs, along
 from kinefit.sensors.visibility.occlusion import drawn_together, of_others
 from kinefit.sensors.visibility.visibility import judge_segments
+from kinefit.solving.correspondences import depth_image_rows, surface_rows
+from kinefit.solving.correspondences.occupancy.free_space import FreeSpace
+from kinefit.solving.rows import AnyRows
 
 
 def window_of(camera: Camera, low: NDArray, high: NDArray) -> tuple[tuple[int, int], tuple[int, int], float]:

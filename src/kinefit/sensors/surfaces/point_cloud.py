@@ -9,23 +9,23 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.body_surfaces import SurfaceAnchors
-from kinefit.correspondences import anchored_rows, free_space_rows, surface_rows, target_rows
-from kinefit.correspondences.anchored import anchored
-from kinefit.correspondences.contours.morphed import on_moved_joints
-from kinefit.correspondences.occupancy.depth_image import SurfaceSamples
-from kinefit.correspondences.occupancy.free_space import FreeSpace
+from kinefit.bodies.surfaces.places import SurfaceAnchors
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
-from kinefit.losses import SQUARED, geman_mcclure
+from kinefit.geometry.losses import SQUARED, geman_mcclure
 from kinefit.observations import PointCloud
-from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor, by_segments, matched_by, rows_at
 from kinefit.sensors.displaced import AXES, CLOCK, displacement
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surfaces.depth_view import camera_at, splat, view_of
+from kinefit.solving.correspondences import anchored_rows, free_space_rows, surface_rows, target_rows
+from kinefit.solving.correspondences.anchored import anchored
+from kinefit.solving.correspondences.contours.morphed import on_moved_joints
+from kinefit.solving.correspondences.occupancy.depth_image import SurfaceSamples
+from kinefit.solving.correspondences.occupancy.free_space import FreeSpace
+from kinefit.solving.rows import AnyRows, DofRows, Rows
 
 
 @dataclass(frozen=True, eq=False)

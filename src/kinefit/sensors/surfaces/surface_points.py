@@ -15,14 +15,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit.bodies.body_surfaces import SurfaceAnchors
-from kinefit.correspondences import surface_rows
+from kinefit.bodies.surfaces.places import SurfaceAnchors
 from kinefit.errors import ObservationError
 from kinefit.observations import SurfacePointFrame
-from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments, of_kind
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.point_cloud import SurfacePairs
+from kinefit.solving.correspondences import surface_rows
+from kinefit.solving.rows import AnyRows, Rows
 
 _MAX_WANDER = 0.05  # of the slide, from step to step on a converged limb: 0.5 mm, a degree of a thin arm
 _MAX_WAIT_STEPS = 10  # until a limb counts as converged: a cloud never fixes the rotation of a round one

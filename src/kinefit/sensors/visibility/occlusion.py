@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from kinefit.bodies import PointSet
 from kinefit.geometry.camera import Camera
 from kinefit.observations import DepthFrame
-from kinefit.rows import DofRows, Rows
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.depth_view import DepthSeen
+from kinefit.solving.rows import DofRows, Rows
 
 MIN_VISIBLE_CONFIDENCE = 0.8  # from which a keypoint counts as visible; detectors give occluded points less
 MAX_VIEW_ANGLE = np.radians(10.0)  # between two cameras' views of the body: 0.5 m behind a hand they are 9 cm apart

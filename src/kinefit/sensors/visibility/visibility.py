@@ -19,18 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.body_surfaces import body_mesh, sample
 from kinefit.bodies.limbs import knuckles, limbs, of_fingers
 from kinefit.bodies.morphs.morphing import MorphedPose, Morphing
+from kinefit.bodies.rendering import Canvas, scaled
 from kinefit.bodies.surfaces import BodyMesh
-from kinefit.correspondences.contours.rims import RimFinder
-from kinefit.correspondences.occupancy.depth_image import SurfaceSamples
-from kinefit.correspondences.targets import check_depth_image
+from kinefit.bodies.surfaces.places import body_mesh, sample
 from kinefit.errors import BodyError
 from kinefit.geometry.camera import Camera
-from kinefit.rendering import Canvas, scaled
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, BELIEVED, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.visibility import _kernels_visibility as kernels
+from kinefit.solving.correspondences.contours.rims import RimFinder
+from kinefit.solving.correspondences.occupancy.depth_image import SurfaceSamples
+from kinefit.solving.correspondences.targets import check_depth_image
 
 RENDER_COLUMNS = 160  # of the rendered image: a person's forearm at 3 m is then four pixels wide
 MIN_CONTOUR_PIXELS = 16  # of a whole segment: fewer are no evidence

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.motion import Motion
+from kinefit.bodies.rendering import scaled
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
-from kinefit.motion import Motion
 from kinefit.observations.videos import DepthVideo
-from kinefit.rendering import scaled
 from kinefit.simulation.rendering.scenes import RenderedView, SimulatedScene, centred_camera
 
 _MIN_EDGE_STEP = 0.1  # [m] within 3 x 3 pixels: an edge, for a sensor that matches patterns

@@ -1,0 +1,1 @@
+"""Labelled markers: placement on a body, subject, poses."""

@@ -1,1 +1,0 @@
-"""Unlabelled markers: who is who (P5)."""

@@ -1,0 +1,253 @@
+"""Adaptive least-squares matching: find a window of one image in another with sub-pixel precision.
+
+The window is moved and deformed by an affine map, and its grey values are stretched and shifted, so that the sum of
+squared differences is least (A. Gruen, Adaptive least squares correlation, 1985). Every match has its standard
+deviation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit._arguments import shaped
+from kinefit.errors import ObservationError
+from kinefit.images.photogrammetry.matching import _kernels_matching as kernels
+from kinefit.images.photogrammetry.matching.noise_correlation import variance_factor
+from kinefit.images.photogrammetry.spline_image import SplineImage, template_share
+
+WINDOW = 13
+"""[px] side of the window, as in the paper."""
+
+MAX_STEPS = 30
+TOLERANCE = 0.001
+"""[px] largest motion of the window's corners at convergence: a tenth of the best precision of matching."""
+
+STATUSES = ("found", "no texture", "outside", "not converged", "not tried")
+"""Names of a match's status numbers."""
+
+_MAX_WINDOW_PX = 151  # side of a window
+_MIN_LEVEL_CORRELATION = 0.6  # a match of a coarser level is a start only above it
+
+
+_ROWS = ("uv", "deformation", "gain", "offset", "correlation", "covariance", "noise", "iterations", "status")
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Windows of one image matched in another.
+
+    Parameters
+    ----------
+    points : (N, 2) [px] centres of the windows in the first image
+    uv : (N, 2) [px] their centres in the second image; NaN where not found
+    deformation : (N, 2, 2) maps an offset from the centre in the first image to the second
+    gain, offset : (N,) grey value of the second image = gain * that of the first + offset
+    correlation : (N,) normalised cross-correlation of the windows
+    covariance : (N, 2, 2) [px²] of `uv`, from the residuals and the texture
+    noise : (N,) combined standard deviation of both images' noise, in grey values
+    iterations : (N,) int
+    status : (N,) int, into `STATUSES`
+    """
+
+    points: NDArray
+    uv: NDArray
+    deformation: NDArray
+    gain: NDArray
+    offset: NDArray
+    correlation: NDArray
+    covariance: NDArray
+    noise: NDArray
+    iterations: NDArray
+    status: NDArray
+
+    @classmethod
+    def of(
+        cls, points: NDArray, rows: NDArray, first: SplineImage, second: SplineImage, halves: NDArray[np.int64]
+    ) -> Matches:
+        """Make matches from rows (N, 15) of the kernels; covariances are scaled up for correlated noise."""
+        status = rows[:, kernels.STATUS].astype(np.int64)
+        found = status == kernels.FOUND
+        out = np.where(found[:, None], rows, np.nan)
+        factor = variance_factor(first, second, points[found], rows[found], halves[found])
+        covariance = factor * out[:, [kernels.VAR_U, kernels.COV, kernels.COV, kernels.VAR_V]].reshape(-1, 2, 2)
+        return cls(
+            points, out[:, : kernels.A], out[:, kernels.A : kernels.A + 4].reshape(-1, 2, 2), out[:, kernels.GAIN],
+            out[:, kernels.OFFSET], out[:, kernels.CORRELATION], covariance, out[:, kernels.NOISE],
+            np.nan_to_num(rows[:, kernels.ITERATIONS]).astype(np.int64), status,
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """(N,) whether each window was found."""
+        return self.status == kernels.FOUND
+
+    @cached_property
+    def std(self) -> NDArray:
+        """(N, 2) [px] standard deviations of `uv`."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+    @cached_property
+    def starts(self) -> NDArray:
+        """(N, 6) position [px] and deformation, as start values of the kernels."""
+        return np.concatenate([self.uv, self.deformation.reshape(-1, 4)], axis=1)
+
+    def or_else(self, other: Matches) -> Matches:
+        """These matches, completed by another attempt at the same points where these were not found."""
+        is_found = self.found
+
+        def either(a: NDArray, b: NDArray) -> NDArray:
+            return np.where(is_found.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+        rows = {name: either(value, getattr(other, name)) for name, value in vars(self).items() if name in _ROWS}
+        return replace(self, **rows)
+
+    def only(self, good: NDArray[np.bool_]) -> Matches:
+        """Mark all matches but those of `good` (N,) as not converged."""
+        rows = {
+            name: np.where(good.reshape(-1, *[1] * (value.ndim - 1)), value, np.nan)
+            for name, value in vars(self).items()
+            if name in _ROWS and np.issubdtype(value.dtype, np.floating)
+        }
+        rejected = self.found & ~good
+        return replace(self, **rows, status=np.where(rejected, kernels.DIVERGED, self.status))
+
+
+def half_sides(window: int | ArrayLike, count: int) -> NDArray[np.int64]:
+    """(N,) half sides of windows of `window` = 2 half + 1 [px], one for all or for each.
+
+    Raises
+    ------
+    ObservationError
+        A window is even, outside of 5 to 151 px, or their number is wrong.
+    """
+    sides = np.asarray(window)
+    if sides.shape not in ((), (count,)) or not np.issubdtype(sides.dtype, np.integer):
+        raise ObservationError(f"windows of shape {sides.shape}", remedy=f"Give a whole number of pixels, or {count}.")
+    if sides.size and (np.any(sides % 2 == 0) or sides.min() < 5 or sides.max() > _MAX_WINDOW_PX):
+        problem = f"a window of {sides.min()} to {sides.max()} px"
+        raise ObservationError(problem, remedy=f"Give an odd number from 5 to {_MAX_WINDOW_PX}.")
+    return np.ascontiguousarray(np.broadcast_to(sides // 2, (count,)), dtype=np.int64)
+
+
+def as_points(points: ArrayLike) -> NDArray:
+    """(N, 2) [px] as a contiguous array for the kernels; raises ObservationError for other shapes."""
+    return np.array(shaped(points, ("N", 2), "points"))
+
+
+def match(
+    first: SplineImage,
+    second: SplineImage,
+    points: ArrayLike,
+    starts: ArrayLike | None = None,
+    *,
+    deformation: ArrayLike | None = None,
+    window: int | ArrayLike = WINDOW,
+    levels: int = 0,
+) -> Matches:
+    """Match windows of one image in another by least squares.
+
+    Parameters
+    ----------
+    first, second : images of any sizes
+    points : (N, 2) [px] centres of the windows in the first image, also between pixels
+    starts : (N, 2) [px] initial centres in the second image, right to about a third of the texture's grain size, or
+        `2**levels` times that; default: `points`
+    deformation : (2, 2) or (N, 2, 2) initial map; default: identity
+    window : odd side [px], of all or of each; see `windows_by_texture`
+    levels : number of coarser pyramid levels, each of half the size, that give the starts
+
+    Raises
+    ------
+    ObservationError
+        Shapes disagree, a window is even, or the images are too small for the pyramid.
+    """
+    at = as_points(points)
+    halves = half_sides(window, len(at))
+    goal = at if starts is None else as_points(starts)
+    maps = np.eye(2) if deformation is None else np.asarray(deformation, float)
+    if goal.shape != at.shape or maps.shape not in ((2, 2), (len(at), 2, 2)):
+        raise ObservationError(
+            f"{len(at)} points, starts of shape {goal.shape}, deformations of shape {maps.shape}",
+            remedy="Give a start and a deformation (2, 2) for each point.",
+        )
+    begin = np.concatenate([goal, np.broadcast_to(maps, (len(at), 2, 2)).reshape(-1, 4)], axis=1)
+    if levels:
+        begin = _coarse_starts(first, second, at, begin, halves, levels)
+    out = np.empty((len(at), kernels.ROW))
+    kernels.match_points(
+        first.coefficients, second.coefficients, at, begin, halves, MAX_STEPS, TOLERANCE,
+        template_share(first, second), first.noise**2, out,
+    )  # fmt: skip
+    return Matches.of(at, out, first, second, halves)
+
+
+def _coarse_starts(
+    first: SplineImage, second: SplineImage, at: NDArray, begin: NDArray, halves: NDArray, levels: int
+) -> NDArray:
+    """Starts (N, 6) from coarser pyramid levels; windows not found there start from the nearest match."""
+    if levels < 0 or min(*first.size, *second.size) >> levels < 32:
+        problem = f"a pyramid of {levels} levels over images of {first.size} and {second.size} px"
+        raise ObservationError(problem, remedy="Use fewer: the highest must have 32 px a side.")
+    pairs = [(first.grey, second.grey)]
+    for _ in range(levels):
+        pairs.append((cv2.pyrDown(pairs[-1][0]), cv2.pyrDown(pairs[-1][1])))
+    for level in range(levels, 0, -1):
+        scale = 0.5**level  # pyrDown keeps pixel (0, 0) where it is
+        one, two = (SplineImage.of(image) for image in pairs[level])
+        start, out = begin.copy(), np.empty((len(at), kernels.ROW))
+        start[:, :2] *= scale
+        share = template_share(one, two)
+        pair = one.coefficients, two.coefficients
+        kernels.match_points(*pair, at * scale, start, halves, MAX_STEPS, 0.01, share, one.noise**2, out)
+        good = (out[:, kernels.STATUS] == kernels.FOUND) & (out[:, kernels.CORRELATION] >= _MIN_LEVEL_CORRELATION)
+        if good.any():
+            near = np.flatnonzero(good)[_nearest(at, at[good])]
+            maps = out[near, 2:6].reshape(-1, 2, 2)
+            begin[:, 2:] = out[near, 2:6]
+            begin[:, :2] = out[near, :2] / scale + np.einsum("nij,nj->ni", maps, at - at[near])
+    return begin
+
+
+def _nearest(at: NDArray, others: NDArray) -> NDArray[np.int64]:
+    """(N,) index of the nearest of `others` (M, 2) to each point (N, 2)."""
+    out = np.empty(len(at), np.int64)
+    for k in range(0, len(at), 1000):  # rows of a table of distances
+        gaps = at[k : k + 1000, None] - others[None]
+        out[k : k + 1000] = np.argmin((gaps**2).sum(axis=2), axis=1)
+    return out
+
+
+def windows_by_texture(
+    first: SplineImage,
+    second: SplineImage,
+    points: ArrayLike,
+    *,
+    std: float = 0.02,
+    windows: tuple[int, ...] = (9, 13, 17, 21, 27, 35, 45),
+) -> NDArray[np.int64]:
+    """(N,) side [px] of the smallest window whose texture predicts a standard deviation.
+
+    Parameters
+    ----------
+    points : (N, 2) [px] in the first image
+    std : [px] in the worst direction, given the noise of both images; 0.02 costs little resolution on good texture
+    windows : odd sides [px] in increasing order; the largest is taken if none suffices
+    """
+    at = as_points(points)
+    sides = np.full(len(at), windows[-1], np.int64)
+    undecided = np.ones(len(at), bool)
+    variance = first.noise**2 + second.noise**2
+    for half, side in zip(half_sides(np.array(windows), len(windows)), windows):
+        out = np.empty(undecided.sum())
+        kernels.predict(first.coefficients, at[undecided], int(half), variance, template_share(first, second), out)
+        sufficient = np.flatnonzero(undecided)[out <= std]
+        sides[sufficient], undecided[sufficient] = side, False
+    return sides

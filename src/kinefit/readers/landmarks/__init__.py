@@ -1,0 +1,1 @@
+"""Files of keypoints, detections and annotations."""

@@ -1,0 +1,1 @@
+"""Videos, the files they come in, and their sound."""

@@ -1,0 +1,144 @@
+"""Detect the two bright targets of a bar in images, to a fraction of a pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import CalibrationError
+from kinefit.rigs.board.detection import grey_image
+from kinefit.rigs.board.sources import Frames, NumberedImages, evenly, opened, sample
+
+_BACKGROUND_IMAGES = 25  # whose median is the scene without the bar: it is elsewhere in more than half of them
+_SPOT_LEVEL = 0.3  # of the way from the background to the peak: lower grey values are no part of a target
+_MIN_RELATIVE_CONTRAST = 0.35  # of a spot to the brightest one; fainter spots are noise
+_MIN_CONTRAST = 30.0  # grey values above the background: less is noise and JPEG blocks
+_MAX_SPOT_SIZE = 0.06  # of the image's width
+_MAX_ASPECT = 3.0  # length over width of a target that moves during exposure; longer spots are reflections
+_MIN_SPOT_PIXELS = 3  # for a centroid
+
+Progress = Callable[[str, int, int], object]
+
+
+@dataclass(frozen=True, eq=False)
+class BarViews:
+    """Detections of a bar in one camera.
+
+    Parameters
+    ----------
+    size : (width, height) [px]
+    ends : {frame: (2, 2) [px]}
+        Centroids of both targets, in any order: an image does not distinguish them.
+    looked : int
+        Number of images searched.
+    """
+
+    size: tuple[int, int]
+    ends: dict[int, NDArray]
+    looked: int
+
+
+def find_bars(
+    sources: Mapping[str, Path | dict[int, Path]], *, max_frames: int = 400, include: tuple[int, ...] = (),
+    progress: Progress | None = None,
+) -> dict[str, BarViews]:
+    """Detect the two targets in all cameras, at the same frames of each.
+
+    The median of some images over the recording is subtracted, so that lamps and windows disappear. An image counts if
+    exactly two compact bright spots remain.
+
+    Parameters
+    ----------
+    sources : of `camera_sources`.
+    max_frames : int
+        Largest number of frames, evenly spaced over the recording.
+    include : frames to search in any case.
+
+    Raises
+    ------
+    CalibrationError
+        A camera without any image of two targets, or videos of different lengths.
+    """
+    with opened(sources) as cameras:
+        wanted, seen = evenly(cameras, max_frames, include), {}
+        total = len(wanted) * len(cameras)
+        for n, (name, camera) in enumerate(cameras.items()):
+            still = _background(camera)
+            own, ends, counts = set(camera.numbers), {}, []
+            for i, frame in enumerate(wanted):
+                if frame in own:
+                    found = targets_in(grey_image(camera.read(frame)), still)
+                    counts.append(len(found))
+                    if len(found) == 2:
+                        ends[frame] = found
+                if progress:
+                    progress("finding targets", n * len(wanted) + i + 1, total)
+            if not ends:
+                _raise_unseen(name, counts)
+            seen[name] = BarViews(camera.size, ends, len(counts))
+    return seen
+
+
+def targets_in(grey: NDArray, still: NDArray | None = None) -> NDArray:
+    """(K, 2) [px] centroids of the bright compact spots of an image, brightest first.
+
+    The centroid is that of the grey values above a level between background and peak (H.-G. Maas, Image
+    sequence based automatic multi-camera system calibration techniques, 1998).
+
+    Parameters
+    ----------
+    grey : (H, W) grey values.
+    still : (H, W), optional
+        The scene without the bar.
+    """
+    risen = grey.astype(np.float32) if still is None else np.maximum(grey.astype(np.float32) - still, 0.0)
+    ground = float(np.median(risen))
+    peak = float(cv2.blur(risen, (2, 2)).max()) - ground  # one hot pixel is no target
+    if peak < _MIN_CONTRAST:
+        return np.empty((0, 2))
+    level = ground + max(_SPOT_LEVEL * _MIN_RELATIVE_CONTRAST * peak, 0.5 * _MIN_CONTRAST)
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats((risen > level).astype(np.uint8), connectivity=8)
+    found = []
+    for k in np.argsort(-boxes[1:, cv2.CC_STAT_AREA])[:50] + 1:
+        left, top, width, height, area = boxes[k]
+        spot = np.where(labels[top : top + height, left : left + width] == k,
+                        risen[top : top + height, left : left + width] - ground, 0.0)
+        contrast = float(spot.max())
+        large = max(width, height) > _MAX_SPOT_SIZE * grey.shape[1]
+        if area < _MIN_SPOT_PIXELS or large or contrast < _MIN_RELATIVE_CONTRAST * peak:
+            continue
+        centre, aspect = _centroid(np.maximum(spot - _SPOT_LEVEL * contrast, 0.0))
+        inside = 1 < left + width / 2 < grey.shape[1] - 2 and 1 < top + height / 2 < grey.shape[0] - 2
+        if aspect < _MAX_ASPECT and inside:
+            found.append((contrast * np.sqrt(area), left + centre[0], top + centre[1]))
+    return np.array([[u, v] for _, u, v in sorted(found, reverse=True)]).reshape(-1, 2)
+
+
+def _centroid(weight: NDArray) -> tuple[NDArray, float]:
+    """Centroid (u, v) of weights (H, W), and their aspect ratio (length over width)."""
+    v, u = np.mgrid[: weight.shape[0], : weight.shape[1]]
+    total = float(weight.sum())
+    centre = np.array([np.sum(u * weight), np.sum(v * weight)]) / total
+    du, dv = u - centre[0], v - centre[1]
+    spread = np.array([[np.sum(weight * du * du), np.sum(weight * du * dv)], [0.0, np.sum(weight * dv * dv)]]) / total
+    spread[1, 0] = spread[0, 1]
+    small, large = np.linalg.eigvalsh(spread + np.eye(2) / 12.0)  # 1/12: variance of one pixel
+    return centre, float(np.sqrt(large / small))
+
+
+def _background(camera: NumberedImages | Frames) -> NDArray | None:
+    images = [grey_image(image) for image in sample(camera, _BACKGROUND_IMAGES)]
+    return np.median(images, axis=0).astype(np.float32) if len(images) >= 5 else None
+
+
+def _raise_unseen(name: str, counts: list[int]) -> None:
+    most = max(set(counts), key=counts.count) if counts else 0
+    raise CalibrationError(
+        f"none of {len(counts)} images shows two bright targets; most show {most}", place=f"camera {name}",
+        remedy="Darken the room or the exposure until the two targets are much brighter than all else that moves.",
+    )

@@ -1,0 +1,223 @@
+"""Relative poses of cameras, from frames in which two of them see one board."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import CalibrationError
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.se3 import inverse, transform
+from kinefit.rigs.board.bundle import Corners
+from kinefit.rigs.board.detection import Board, BoardView, CameraViews
+
+_MAX_AMBIGUITY_RATIO = 3.0  # of the errors of a flat board's two poses; with more the second is discarded
+_MAX_PROPOSALS = 25  # frames that propose a relative pose; all shared frames vote
+_MAX_ERROR = 0.01  # of the image diagonal, between a camera's view and the board's pose from another view
+_MIN_VOTES = 3  # fewer frames may agree by chance
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses of the board from one view: candidates (K, 4, 4) T_camera_board, best first, and rays (n, 2)."""
+
+    view: BoardView
+    Ts_camera_board: NDArray
+    xy: NDArray  # (n, 2) normalised image coordinates
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Rig in the frame of its first camera, poses of the board in it, the corners, and the votes of each pair."""
+
+    rig: Rig
+    Ts_world_board: NDArray
+    frames: tuple[int, ...]
+    corners: Corners
+    agreeing: dict[tuple[str, str], int]
+
+
+def place_cameras(cameras: Mapping[str, Camera], seen: Mapping[str, CameraViews], board: Board) -> Placed:
+    """Chain the cameras by the pairs with most votes, and estimate the board's pose in every frame.
+
+    Raises
+    ------
+    CalibrationError
+        Cameras that share no view, or whose shared views contradict each other.
+    """
+    poses = {
+        name: {frame: _poses(cameras[name], view, board) for frame, view in views.frames.items()}
+        for name, views in seen.items()
+    }
+    links: dict[tuple[str, str], NDArray] = {}
+    votes: dict[tuple[str, str], int] = {}
+    shared: dict[tuple[str, str], int] = {}
+    for a, b in combinations(cameras, 2):
+        common = sorted(poses[a].keys() & poses[b].keys())
+        shared[a, b] = len(common)
+        if common:
+            T_b_a, agree = _vote(cameras[b], [(poses[a][f], poses[b][f]) for f in common], board)
+            # One shared frame gives a pose without any check of it.
+            if agree >= min(_MIN_VOTES, len(common)) and agree >= 0.3 * len(common):
+                links[a, b], votes[a, b] = T_b_a, agree
+    Ts_camera_world = _chain(list(cameras), links, votes, shared)
+    rig = Rig(tuple(camera.with_pose(Ts_camera_world[name]) for name, camera in cameras.items()))
+    return _place_boards(rig, poses, board, votes)
+
+
+def _poses(camera: Camera, view: BoardView, board: Board) -> Poses:
+    """Both poses of a flat board that one view allows (T. Collins and A. Bartoli, IJCV 2014)."""
+    rays = camera.with_pose(np.eye(4)).ray(view.uv)
+    ok = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.05)
+    view = BoardView(view.frame, view.ids[ok], view.uv[ok], view.mirrored)
+    xy = rays[ok, :2] / rays[ok, 2:]
+    candidates: list[tuple[float, NDArray]] = []
+    if len(xy) >= 4:
+        x = board.corners[view.ids]
+        try:
+            found = cv2.solvePnPGeneric(x, xy, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+        except cv2.error:  # the remaining corners lie on one line
+            found = (0, (), (), ())
+        for r, t, error in zip(found[1], found[2], np.ravel(found[3])):
+            T = transform(cv2.Rodrigues(r)[0], np.ravel(t))
+            if np.isfinite(T).all() and (T[:3] @ np.c_[x, np.ones(len(x))].T)[2].min() > 0:
+                candidates.append((float(error), T))
+    candidates.sort(key=lambda pair: pair[0])
+    floor = 0.3 / camera.matrix[0, 0]  # both fit within the noise of a corner
+    kept = [T for error, T in candidates if error <= _MAX_AMBIGUITY_RATIO * max(candidates[0][0], floor)]
+    return Poses(view, np.array(kept).reshape(-1, 4, 4), xy)
+
+
+def _turned(board: Board) -> list[NDArray]:
+    """T_board_board (4, 4) of every rotation that maps the board onto itself."""
+    out = []
+    for order in board.symmetries:
+        flat, turned = board.corners[:, :2], board.corners[order][:, :2]
+        a, b = flat - flat.mean(axis=0), turned - turned.mean(axis=0)
+        u, _, vt = np.linalg.svd(b.T @ a)
+        R = np.eye(3)
+        R[:2, :2] = u @ vt
+        out.append(transform(R, np.append(turned.mean(axis=0) - R[:2, :2] @ flat.mean(axis=0), 0.0)))
+    return out
+
+
+def _view_error(T_camera_board: NDArray, poses: Poses, board: Board) -> float:
+    """Median distance of a view's corners from their projections at a pose of the board, in normalised coordinates."""
+    best = np.inf
+    for order in board.symmetries:
+        x = board.corners[order[poses.view.ids]] @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
+        if x[:, 2].min() > 0:
+            best = min(best, float(np.median(np.linalg.norm(x[:, :2] / x[:, 2:] - poses.xy, axis=1))))
+    return best
+
+
+def _vote(camera: Camera, pairs: list[tuple[Poses, Poses]], board: Board) -> tuple[NDArray, int]:
+    """T_b_a with the lowest robust cost over shared frames (MLESAC), and the number of frames that agree."""
+    limit = _MAX_ERROR * float(np.hypot(*camera.size)) / camera.matrix[0, 0]
+    chosen = [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_PROPOSALS)).astype(int))]
+    best, best_T, best_agree = np.inf, np.eye(4), 0
+    turns = _turned(board)
+    for a, b in chosen:
+        for T_a, T_b, turn in product(a.Ts_camera_board, b.Ts_camera_board, turns):
+            T_b_a = T_b @ turn @ inverse(T_a)
+            cost, agree = 0.0, 0
+            for in_a, in_b in pairs:
+                error = min([_view_error(T_b_a @ T, in_b, board) for T in in_a.Ts_camera_board] or [np.inf])
+                cost, agree = cost + min(error, limit), agree + (error < limit)
+                if cost >= best:
+                    break
+            else:
+                best, best_T, best_agree = cost, T_b_a, agree
+    return best_T, best_agree
+
+
+def _chain(
+    names: list[str],
+    links: Mapping[tuple[str, str], NDArray],
+    votes: Mapping[tuple[str, str], int],
+    shared: Mapping[tuple[str, str], int],
+) -> dict[str, NDArray]:
+    """T_camera_world of every camera, in the frame of the first: the spanning tree of most votes (Prim)."""
+    placed = {names[0]: np.eye(4)}
+    while len(placed) < len(names):
+        across = [(n, pair) for pair, n in votes.items() if (pair[0] in placed) != (pair[1] in placed)]
+        if not across:
+            _raise_unconnected(names, set(placed), shared)
+        _, (a, b) = max(across)
+        if a in placed:
+            placed[b] = links[a, b] @ placed[a]
+        else:
+            placed[a] = inverse(links[a, b]) @ placed[b]
+    return placed
+
+
+def _raise_unconnected(names: list[str], placed: set[str], shared: Mapping[tuple[str, str], int]) -> None:
+    rest = [name for name in names if name not in placed]
+    group = ", ".join(name for name in names if name in placed)
+    common = {pair: n for pair, n in shared.items() if (pair[0] in placed) != (pair[1] in placed) and n}
+    if common:
+        (a, b), n = max(common.items(), key=lambda item: item[1])
+        raise CalibrationError(
+            f"{a} and {b} see the board in {n} common frames, but these contradict each other about the poses",
+            place=f"cameras {group} against {', '.join(rest)}",
+            remedy="Give synchronised videos that are not mirrored.",
+        )
+    raise CalibrationError(
+        f"no frame in which one of {group} and one of {', '.join(rest)} see the board",
+        place=f"cameras {', '.join(rest)}",
+        remedy="Record the board where two of them see it at the same time; 10 frames or more, in different places.",
+    )
+
+
+def _place_boards(
+    rig: Rig, poses: Mapping[str, Mapping[int, Poses]], board: Board, votes: dict[tuple[str, str], int]
+) -> Placed:
+    """The pose of the board with the lowest cost in every frame, with all views' corners in a common order."""
+    frames = sorted({frame for of_camera in poses.values() for frame in of_camera})
+    Ts: list[NDArray] = []
+    kept, columns = [], []
+    for frame in frames:
+        here = [(c, poses[camera.name][frame]) for c, camera in enumerate(rig) if frame in poses[camera.name]]
+        limits = [_MAX_ERROR * float(np.hypot(*camera.size)) / camera.matrix[0, 0] for camera in rig]
+        best, best_T = np.inf, None
+        for c, of_view in here:
+            for T_camera_board in of_view.Ts_camera_board:
+                T = rig.cameras[c].T_world_camera @ T_camera_board
+                cost = sum(min(_view_error(rig.cameras[d].T_camera_world @ T, p, board), limits[d]) for d, p in here)
+                if cost < best:
+                    best, best_T = cost, T
+        if best_T is None:
+            continue
+        for c, of_view in here:
+            T = rig.cameras[c].T_camera_world @ best_T
+            if _view_error(T, of_view, board) < limits[c]:
+                columns.append((c, len(Ts), *_named(T, of_view, board)))
+        Ts.append(best_T)
+        kept.append(frame)
+    if len({c for c, *_ in columns}) < len(rig):
+        without = [camera.name for c, camera in enumerate(rig) if c not in {c for c, *_ in columns}]
+        raise CalibrationError(
+            "no view of the board fits its intrinsics",
+            place=f"camera {', '.join(without)}",
+            remedy="Check the given intrinsics and the board's size, or calibrate the intrinsics too.",
+        )
+    camera = np.concatenate([np.full(len(uv), c) for c, _, _, uv in columns])
+    index = np.concatenate([np.full(len(uv), f) for _, f, _, uv in columns])
+    corners = Corners(
+        camera, index, np.concatenate([x for *_, x, _ in columns]), np.concatenate([uv for *_, uv in columns])
+    )
+    return Placed(rig, np.array(Ts), tuple(kept), corners, votes)
+
+
+def _named(T_camera_board: NDArray, poses: Poses, board: Board) -> tuple[NDArray, NDArray]:
+    """Corners of a view in the board's frame, in the order of the pose, and their pixels."""
+    errors = []
+    for order in board.symmetries:
+        x = board.corners[order[poses.view.ids]] @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
+        errors.append(np.median(np.linalg.norm(x[:, :2] / x[:, 2:] - poses.xy, axis=1)))
+    return board.corners[board.symmetries[int(np.argmin(errors))][poses.view.ids]], poses.view.uv

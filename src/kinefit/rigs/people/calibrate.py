@@ -1,0 +1,232 @@
+"""Where cameras stand, from the people in view alone: their own keypoints are the calibration object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit._arguments import checked, renamed
+from kinefit.bodies import Body, PointSet
+from kinefit.bodies.limbs import rigid_pairs
+from kinefit.errors import CalibrationError
+from kinefit.fitting.multiview.association import person_records
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.lines import triangulate, triangulate_robust
+from kinefit.observations import KEYPOINT_SIGMA, Keypoints
+from kinefit.rigs.people.first_rig import first_rig
+from kinefit.rigs.people.floor import centre_of_mass, settled
+from kinefit.rigs.people.skeletons import first_cameras, in_step, steady_person
+from kinefit.rigs.refine.gauge import resized
+from kinefit.rigs.refine.refine import Length, check_input, length_of, prior_sigma, refine_from
+from kinefit.rigs.refine.result import Refinement
+from kinefit.rigs.refine.sightings import PersonSighting, PersonTrial, Progress
+from kinefit.sensors.channels import Channels, make_channels
+from kinefit.solving.bundle.adjust import BundleState, adjust
+from kinefit.solving.bundle.body_bundle import PointProblem
+from kinefit.solving.bundle.cameras import FOCAL, TIME, CameraPrior, PointPixels
+
+_MIN_CONFIDENCE = 0.3  # confidence of a keypoint that takes part in the start
+_MAX_POINTS = 2500  # points in space of the start
+_MAX_OTHER_POINTS = 1000  # of more people, beside the one whose body is fitted
+_FLAT_POSE_SIGMAS = 20.0, 3.0  # [m], [rad] no prior to speak of
+GUESSED_FOCAL_SIGMA = 0.25  # of a focal length's logarithm: 64 degrees stand for 52 to 78 (one standard deviation)
+STATED_FOCAL_SIGMA = 0.1  # the same, of a stated one: the crop of videos differs by as much
+_CLOCKS, _NEAR_CLOCKS = 2.0, 0.05  # [s] clocks of cameras that were started by hand; what the first look leaves
+_LOSS_SIGMAS = 8.0, 4.0, 2.0, 1.0  # standard deviations of a keypoint at which the robust loss begins, and ends
+_CORRELATED_PIXELS = 20.0  # pixels of a detector that tell as much of a lens as one: their errors come together
+_BEFORE = 0.05  # of the rig's size: points nearer to a camera are triangulated badly
+_MAX_RAY_SIGMAS = 5.0  # standard deviations within which the cameras' rays meet, before they are adjusted
+
+
+@renamed(accuracy="sigma")
+@checked
+def calibrate_people(
+    cameras: Sequence[Camera],
+    keypoints: Sequence[Keypoints],
+    body: Body,
+    *,
+    height: float | None = None,
+    known_length: Length | None = None,
+    focal: bool | Sequence[float] = False,
+    time_offsets: bool | float = False,
+    up: str = "z",
+    sigma: float = KEYPOINT_SIGMA,
+    progress: Progress | None = None,
+) -> Refinement:
+    """Poses of cameras whose intrinsics are known, from a person who moves in front of them.
+
+    Where a network lifted people to space in each camera, these skeletons are laid on each other: turns, clocks and
+    distances come from them (`first_cameras`). Else essential matrices choose the pair to start from, and the other
+    cameras are laid on its points (`first_rig`). Free points, then the body of one person with its constant bone
+    lengths beside the free points of the others, are adjusted together with all cameras.
+
+    Parameters
+    ----------
+    cameras : their names, sizes, matrices and distortions; poses are not used.
+    keypoints : records of the same number of frames and the same rate.
+    body : Body, generic.
+    height : float [m] stature of the person: sets the scale; default: the generic body's bones.
+    known_length : (point, point, [m]) of the body: sets the scale instead.
+    focal : bool or (C,) floats, the cameras' lenses are guesses: estimate focal lengths, too; how far each may be off,
+        as a share of it, default 0.25.
+    time_offsets : bool or float [s], estimate time offsets, too: up to so much, default 2 s, with `lifted` keypoints,
+        else a few frames.
+    up : str, vertical axis that the world shall have.
+
+    Raises
+    ------
+    CalibrationError
+        Too few common keypoints, a camera that fits no other, cameras too close together, too little motion.
+    ObservationError
+        Streams that differ; a height or length that cannot be.
+    """
+    step = progress or (lambda *_: None)
+    given = Rig(tuple(camera.with_pose(np.eye(4)) for camera in cameras))
+    check_input(given, keypoints, height, known_length)
+    step("first cameras", 0, 2)
+    late = np.zeros(len(given), int)
+    rate, frames = keypoints[0].rate, len(keypoints[0])
+    first: Rig | None = None
+    others: Sequence[Sequence[Keypoints]] = ()
+    if all(record.lifted is not None for record in keypoints):
+        start = first_cameras(cameras, keypoints, within=_CLOCKS if time_offsets is True else float(time_offsets))
+        first, alone, others, late = start.rig, list(start.people), start.others, start.frames_late
+    else:
+        alone = [steady_person(record) for record in keypoints]
+    keypoints = [in_step(record, n, frames) for record, n in zip(keypoints, late, strict=True)]
+    seen = [_common(body, given, one, late, frames, sigma) for one in (alone, *others)]
+    (points, uv), *beside = seen
+    rig = first or first_rig(given, uv.reshape(-1, len(given), 2), sigma)
+    step("first cameras", 1, 2)
+    spread = np.broadcast_to(GUESSED_FOCAL_SIGMA if focal is True else focal, len(given)).astype(float)
+    clock = _NEAR_CLOCKS if time_offsets else 0.0
+    rig, x = _adjusted(rig, given, [u for _, u in seen], sigma, focal=spread, clock=clock, rate=rate)
+    factor = _whole_scale(body, points, x, height)
+    rig = settled(resized(rig, factor), factor * x, _above_soles(body, points), up=up)
+    step("first cameras", 2, 2)
+    prior_std = prior_sigma(len(rig), focal=bool(spread.any()), distortion=False, time_offsets=bool(time_offsets))
+    prior_std[:, :3], prior_std[:, 3:6], prior_std[:, FOCAL] = *_FLAT_POSE_SIGMAS, spread
+    prior = CameraPrior(Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True))), prior_std)
+
+    def stand(rig: Rig, seen: PersonSighting) -> tuple[Rig, str]:
+        return _on_the_floor(rig, seen, body, height, known_length, up)
+
+    trial = PersonTrial(keypoints, body, up, sigma)
+    free = free_points(rig, [u for _, u in beside], sigma)
+    found = refine_from(rig, trial, prior, stand, free=free, progress=progress, from_scratch=True)
+    offsets = {name: found.time_offsets[name] + float(n) / rate for name, n in zip(rig.names, late, strict=True)}
+    clocks = {name: replace(found.cameras[name], time=offsets[name]) for name in rig.names}
+    return replace(found, time_offsets=offsets, cameras=clocks)
+
+
+def _common(
+    body: Body, rig: Rig, one: Sequence[Keypoints], late: NDArray, frames: int, sigma: float
+) -> tuple[PointSet, NDArray]:
+    """Points of one person, and (F, K, C, 2) [px] where each camera saw them, by whole frames in step."""
+    moved = [in_step(record, int(n), frames) for record, n in zip(one, late, strict=True)]
+    records = person_records(moved, [np.zeros(frames, int) for _ in moved])
+    channels = make_channels(body, rig, records, [sigma] * len(moved))
+    return channels.points, common_pixels(channels)
+
+
+def free_points(rig: Rig, people: Sequence[NDArray], sigma: float) -> PointPixels:
+    """Points of more people (F, K, C, 2) [px] each, free in every frame: those that cameras agree on.
+
+    They tell of the cameras wherever these people were, and nothing of bodies.
+    """
+    flat = np.concatenate([np.zeros((0, len(rig), 2)), *(uv.reshape(-1, len(rig), 2) for uv in people)])
+    agree = triangulate_robust(rig, flat, max_residual_px=2.0 * _MAX_RAY_SIGMAS * sigma)[1]
+    good = np.flatnonzero(agree.sum(axis=1) >= 2)
+    some = np.linspace(0, max(len(good) - 1, 0), min(_MAX_OTHER_POINTS, len(good)))
+    good = good[np.unique(some.astype(int))]
+    point, camera = np.nonzero(agree[good] & np.isfinite(flat[good]).all(axis=-1))
+    return PointPixels(camera, point, flat[good][point, camera], np.full(len(point), sigma**-2))
+
+
+def common_pixels(channels: Channels) -> NDArray:
+    """(F, K, C, 2) [px] of every point in every camera, NaN where unseen or unsure."""
+    out = np.full((len(channels.uv), len(channels.points), len(channels.rig), 2), np.nan)
+    sure = np.where((channels.confidence > _MIN_CONFIDENCE)[..., None], channels.uv, np.nan)
+    out[:, channels.column, channels.camera] = sure
+    return out
+
+
+def _adjusted(
+    rig: Rig, given: Rig, people: Sequence[NDArray], sigma: float, *, focal: NDArray, clock: float, rate: float
+) -> tuple[Rig, NDArray]:
+    """The rig adjusted with free points, from coarse to fine, and the first person's points (F, K, 3) in its units.
+
+    focal: (C,) standard deviations of the logarithms of the lenses' focal lengths about the given ones, clock [s] of
+    what is left of the cameras' offsets; 0 holds them.
+    """
+    flat = np.concatenate([uv.reshape(-1, len(rig), 2) for uv in people])
+    speed = np.concatenate([np.gradient(uv, axis=0).reshape(-1, len(rig), 2) for uv in people])
+    speed = np.nan_to_num(speed * rate)
+    many = np.flatnonzero(np.isfinite(flat).all(axis=-1).sum(axis=1) >= 2)
+    many = many[np.unique(np.linspace(0, len(many) - 1, min(_MAX_POINTS, len(many))).astype(int))]
+    offsets = np.zeros(len(rig))
+    for coarse in _LOSS_SIGMAS:
+        size = float(np.linalg.norm(np.ptp([c.centre_world for c in rig], axis=0)))
+        x = triangulate(rig, flat[many])
+        seen = np.isfinite(flat[many]).all(axis=-1)
+        ahead = np.stack([se3.apply(c.T_camera_world, x)[:, 2] for c in rig], axis=1) > _BEFORE * size
+        good = np.isfinite(x).all(axis=1) & (ahead | ~seen).all(axis=1)
+        point, camera = np.nonzero(seen[good])
+        chosen = many[good][point], camera
+        weight = np.full(len(point), (coarse * sigma) ** -2)
+        pixels = PointPixels(camera, point, flat[chosen], weight, speed[chosen] if clock else None)
+        prior_std = prior_sigma(len(rig), focal=False, distortion=False, time_offsets=False)
+        prior_std[:, :3], prior_std[:, 3:6] = 10.0 * size, _FLAT_POSE_SIGMAS[1]
+        prior_std[:, FOCAL] = focal / np.sqrt(_CORRELATED_PIXELS)
+        prior_std[1:, TIME] = clock
+        mean = Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True)))
+        found = adjust(BundleState(rig, offsets, x[good]), CameraPrior(mean, prior_std), PointProblem(pixels)).state
+        rig, offsets = found.rig, found.offsets
+    first = people[0].reshape(-1, len(rig), 2)
+    x = triangulate_robust(rig, first, max_residual_px=_MAX_RAY_SIGMAS * sigma)[0]
+    return rig, x.reshape(*people[0].shape[:2], 3)
+
+
+def _whole_scale(body: Body, points: PointSet, x: NDArray, height: float | None) -> float:
+    """Factor that gives the person the generic body's bones, or bones in proportion to a height [m]."""
+    ratios = []
+    for i, j, _, length in rigid_pairs(body, points):
+        distance = np.linalg.norm(x[:, i] - x[:, j], axis=1)
+        if np.isfinite(distance).sum() >= 3:
+            ratios.append(float(np.nanmedian(distance)) / length)
+    if not ratios:
+        raise CalibrationError(
+            "no bone of the person can be measured", remedy="Record a person in full view of two cameras at once."
+        )
+    whole = height / body.stature if height and body.stature else 1.0
+    return whole / float(np.median(ratios))
+
+
+def _above_soles(body: Body, points: PointSet) -> NDArray:
+    """(K,) [m] height of points above the soles of the body at rest."""
+    lowest = min(body.points_rest(body.landmarks)[:, 1].min(), body.points_rest(points)[:, 1].min())
+    return body.points_rest(points)[:, 1] - lowest
+
+
+def _on_the_floor(
+    rig: Rig, seen: PersonSighting, generic: Body, height: float | None, known_length: Length | None, up: str
+) -> tuple[Rig, str]:
+    """The rig with floor, origin and scale by the rule, and the rule."""
+    body = seen.motion.body
+    factor = sum(generic.segment_lengths().values()) / sum(body.segment_lengths().values())
+    rule = "the scale is that of a person of mean proportions (a few per cent uncertain: give a height or a length)"
+    if known_length is not None:
+        a, b, metres = known_length
+        factor, rule = metres / length_of(seen, a, b), f"{a} to {b} is {metres:g} m long"
+    elif height is not None and body.stature > 0:
+        factor, rule = height / body.stature, f"the person is {height:g} m tall"
+    x = factor * seen.motion.positions()
+    rig = settled(
+        resized(rig, factor), x, factor * _above_soles(body, body.landmarks),
+        balance=factor * centre_of_mass(seen.motion), up=up,
+    )  # fmt: skip
+    return rig, f"The floor is at height zero, {up} is up, the origin lies below the person's mean position; {rule}."

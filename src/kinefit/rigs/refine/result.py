@@ -1,0 +1,222 @@
+"""Result of a refinement: the rig, its changes, and their uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.motion import Motion
+from kinefit.geometry.camera import Rig
+from kinefit.rigs.refine.gauge import aligned, covariance_in_gauge
+from kinefit.rigs.refine.sightings import PersonSighting, correlation_time
+from kinefit.solving.bundle.adjust import Bundle, BundleState, adjust
+from kinefit.solving.bundle.body_bundle import BodyProblem
+from kinefit.solving.bundle.cameras import COLUMNS, FOCAL, TIME, camera_jacobian, departure
+
+MAX_STATIC_SIGMA_PX = 3.0
+"""Standard deviation of a static point's residual near the person, up to which a rig is reliable."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraChange:
+    """Change of one camera by a refinement.
+
+    Parameters
+    ----------
+    residual_before, residual_after : float [px] median over its keypoints, of the tracked body.
+    bias_after : (2,) [px] median shift, measured minus fitted.
+    turn, shift : float [rad], [m] by which it was rotated and moved.
+    focal : float, change of the focal length as a share.
+    time : float [s] to add to its times.
+    turn_std, shift_std, focal_std, time_std : float
+        Standard deviation of each, in the stated gauge; 0 if fixed.
+    uncertainty : float [px] standard deviation of a static point's residual near the person.
+    """
+
+    residual_before: float
+    residual_after: float
+    bias_after: NDArray
+    turn: float
+    shift: float
+    focal: float
+    time: float
+    turn_std: float
+    shift_std: float
+    focal_std: float
+    time_std: float
+    uncertainty: float
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """A refined rig with its uncertainty.
+
+    Parameters
+    ----------
+    rig : Rig
+    time_offsets : {camera: [s]} to add to each camera's, the first camera's being 0.
+    cameras : {camera: CameraChange}
+    gauge : str, the rule that fixes position, rotation and scale of the world.
+    frames : (F,) int used.
+    confident : bool
+        Whether `uncertainty` is at most 3 px in every camera.
+    motion : Motion tracked with the new rig.
+    point_std : float [m] standard deviation of a triangulated point near the person.
+    static : {point: [px]} median residual of the given static points, triangulated with the new rig.
+    from_scratch : bool, no poses were known before; then `turn` and `shift` are relative to an initial guess.
+    """
+
+    rig: Rig
+    time_offsets: Mapping[str, float]
+    cameras: Mapping[str, CameraChange]
+    gauge: str
+    frames: NDArray
+    confident: bool
+    motion: Motion
+    point_std: float
+    static: Mapping[str, float]
+    from_scratch: bool = False
+
+    def summary_lines(self) -> list[str]:
+        """Lines of text that summarise the result."""
+        known = f"points about the person known to {1e3 * self.point_std:.0f} mm"
+        out = [f"{len(self.frames)} frames; {known}. {self.gauge}"]
+        for name, c in self.cameras.items():
+            turn, shift = f"± {np.degrees(c.turn_std):.2f}°", f"± {1e3 * c.shift_std:.0f} mm"
+            if self.from_scratch:
+                line = f"{name}: residual {c.residual_after:.1f} px; placed {shift}, {turn}"
+            else:
+                line = (
+                    f"{name}: residual {c.residual_before:.1f} -> {c.residual_after:.1f} px; turned "
+                    f"{np.degrees(c.turn):.2f} {turn}, moved {1e3 * c.shift:.0f} {shift}"
+                )
+            if c.focal_std:
+                line += f", focal length {100 * c.focal:+.2f} ± {100 * c.focal_std:.2f} %"
+            if c.time_std or c.time:
+                line += f", clock {1e3 * c.time:+.1f} ± {1e3 * c.time_std:.1f} ms"
+            out.append(f"{line}; static points known to {c.uncertainty:.1f} px")
+        if not self.confident:
+            out.append("Uncertain: more movement through the whole volume would place the cameras better.")
+        return out
+
+
+def changes_of(
+    old: Rig, rig: Rig, first: PersonSighting, last: PersonSighting, covariance: NDArray, offsets: NDArray
+) -> tuple[dict[str, CameraChange], float]:
+    """Change of each camera, and the standard deviation [m] of a triangulated point.
+
+    covariance (C · 16, C · 16) is of the cameras' parameters, offsets (C,) [s] of their clocks.
+    """
+    clock = np.zeros((len(rig), len(covariance)))  # relative to the first camera: a common delay has no effect
+    clock[np.arange(len(rig)), np.arange(TIME, len(covariance), COLUMNS)] = 1.0
+    clock[:, TIME] -= 1.0
+    clock_std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", clock, covariance, clock), 0.0))
+    pixel, distance = expected_errors(rig, covariance, places(last.motion))
+    moved = departure(rig, old)
+    out = {}
+    for c, name in enumerate(rig.names):
+        std = np.sqrt(np.maximum(np.diag(covariance)[c * COLUMNS : (c + 1) * COLUMNS], 0.0))
+        before, after = (_camera_residuals(s, c) for s in (first, last))
+        out[name] = CameraChange(
+            residual_before=float(np.median(np.linalg.norm(before, axis=-1))),
+            residual_after=float(np.median(np.linalg.norm(after, axis=-1))),
+            bias_after=np.median(after, axis=0),
+            turn=float(np.linalg.norm(moved[c, 3:6])),
+            shift=float(np.linalg.norm(rig.cameras[c].centre_world - old.cameras[c].centre_world)),
+            focal=float(np.expm1(moved[c, FOCAL])), time=float(offsets[c]),
+            turn_std=float(np.linalg.norm(std[3:6])), shift_std=float(np.linalg.norm(std[:3])),
+            focal_std=float(std[FOCAL]), time_std=float(clock_std[c]),
+            uncertainty=float(pixel[c]),
+        )  # fmt: skip
+    return out, distance
+
+
+def _camera_residuals(seen: PersonSighting, camera: int) -> NDArray:
+    """(M, 2) [px] residuals of a camera's observed keypoints."""
+    own = seen.residuals[:, seen.channels.camera == camera].reshape(-1, 2)
+    own = own[np.isfinite(own).all(axis=1)]
+    return own if len(own) else np.full((1, 2), np.inf)
+
+
+def places(motion: Motion) -> NDArray:
+    """(P, 3) [m] points spread over the box in which the person moved."""
+    x = motion.segment_poses()[..., :3, 3].reshape(-1, 3)
+    return np.stack(np.meshgrid(*np.linspace(x.min(axis=0), x.max(axis=0), 4).T), axis=-1).reshape(-1, 3)
+
+
+def expected_errors(rig: Rig, covariance: NDArray, x_world: NDArray) -> tuple[NDArray, float]:
+    """Standard deviations of triangulated static points (P, 3) [m], median over the points.
+
+    covariance (C · 16, C · 16) is of the cameras. Returns (C,) [px] those of the residual in each camera, and [m] that
+    of the point.
+    """
+    J_camera = np.stack([camera_jacobian(camera, x_world) for camera in rig], axis=1)
+    J_camera[..., TIME] = 0.0
+    J_point = np.stack([camera.project_with_jacobian(x_world)[1] for camera in rig], axis=1)
+    seen = np.isfinite(J_point).all(axis=(2, 3))
+    seen &= (seen.sum(axis=1) >= 2)[:, None]
+    J_point = np.where(seen[..., None, None], J_point, 0.0)
+    pixel, distance = np.full((len(x_world), len(rig)), np.nan), np.full(len(x_world), np.nan)
+    for p in np.flatnonzero(seen.any(axis=1)):
+        J = np.zeros((2 * len(rig), covariance.shape[0]))
+        for c in np.flatnonzero(seen[p]):
+            J[2 * c : 2 * c + 2, c * COLUMNS : (c + 1) * COLUMNS] = J_camera[p, c]
+        A = J_point[p].reshape(-1, 3)
+        to_point = -np.linalg.pinv(A) @ J
+        left = J + A @ to_point
+        variance = np.einsum("ij,jk,ik->i", left, covariance, left).reshape(-1, 2).sum(axis=1)
+        pixel[p, seen[p]] = np.sqrt(np.maximum(variance, 0.0))[seen[p]]
+        distance[p] = np.sqrt(max(np.trace(to_point @ covariance @ to_point.T), 0.0))
+    known = np.isfinite(pixel).any(axis=0)
+    out = np.full(len(rig), np.inf)
+    out[known] = np.nanmedian(pixel[:, known], axis=0)
+    return out, float(np.nanmedian(distance)) if np.isfinite(distance).any() else np.inf
+
+
+_MAX_JACKKNIFE_FRAMES = 40
+
+
+def chance(bundle: Bundle, seen: PersonSighting, frames: NDArray) -> NDArray:
+    """Covariance (C · 16, C · 16) of the cameras from random errors.
+
+    Their variance and correlation time are those of the residuals without each channel's mean.
+    """
+    values = seen.trusted
+    counts = np.isfinite(values).all(axis=-1).sum(axis=0)
+    mean = np.nansum(values, axis=0) / np.maximum(counts, 1)[:, None]
+    new = min(1.0, len(values) / max(len(frames), 1) / correlation_time(values - mean))  # independent share of frames
+    share = seen.confidence / np.square(seen.channels.sigma)
+    power = float(np.nanmean(np.sum((values - mean) ** 2, axis=-1) * share)) / 2.0
+    return covariance_in_gauge(bundle.state.rig, bundle.S * new / max(power, 1e-12), bundle.prior.free.ravel())
+
+
+def bias(problem: BodyProblem, bundle: Bundle) -> NDArray:
+    """Covariance (C · 16, C · 16) of the cameras from systematic errors.
+
+    A detector's points are biased against the anatomical ones, differently in each view. Grouped jackknife (M.
+    Quenouille, 1956; J. Tukey, 1958): fit the cameras without the points of each segment in turn.
+    """
+    frames, state = problem.frames, bundle.state
+    some = np.unique(np.linspace(0, len(frames.uv) - 1, min(_MAX_JACKKNIFE_FRAMES, len(frames.uv))).astype(int))
+    owner = frames.points.segments[frames.column]
+    groups = np.unique(owner)
+
+    def fit(start: BundleState, without: int | None) -> BundleState:
+        kept = np.ones(len(owner)) if without is None else (owner != without).astype(float)
+        weight, velocity = frames.weight[some] * kept, frames.velocity[some]
+        part = replace(frames, uv=frames.uv[some], weight=weight, velocity=velocity)
+        start = replace(start, offsets=state.offsets)
+        return adjust(start, bundle.prior, replace(problem, frames=part), iterations=6, tolerance=1e-3).state
+
+    whole = fit(replace(state, states=[state.states[f] for f in some]), None)
+    away = []
+    for group in groups:
+        part = fit(whole, int(group))
+        row = departure(aligned(part.rig, whole.rig)[0], whole.rig)
+        row[:, TIME] = part.offsets - whole.offsets
+        away.append(row.ravel())
+    spread = np.array(away) - np.mean(away, axis=0)
+    return (len(groups) - 1) / len(groups) * spread.T @ spread

@@ -1,0 +1,254 @@
+"""Closures of a body as rows (P3 3.2, eq. 15, linearised in both points).
+
+A point x_a of one segment stays at x_b of another (or of the world) along the directions n of b's frame:
+
+    r = n·(x_b − x_a),    δr = −(n, x_a × n)·(δξ_a − δξ_b)
+
+Both twists act at x_a, because n rotates with b. A rigid closure also has e = log((R_b R_turn)ᵀ R_a), with
+δe = J_l⁻¹(e) (R_b R_turn)ᵀ (δω_a − δω_b). Soft closures are rows with their standard deviation, as in the paper. Hard
+ones are equations for `solvers.closed`, or rows with `HARD_SIGMA` in a quadratic cost.
+
+The paper linearises (15) as (18) and (19) instead: each point is pulled to the position of the other one, which is kept
+constant. That is `point_rows` of `closure_targets`. Both have the same gradient −Jᵀ W c, and so the same solution.
+Their matrices differ: Jₐᵀ W Jₐ + J_bᵀ W J_b also constrains the position of the pair, (Jₐ − J_b)ᵀ W (Jₐ − J_b) does
+not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.parts import has_unknown_gear, with_dimensions
+from kinefit.errors import BodyError
+from kinefit.geometry import se3
+from kinefit.solving.correspondences import _kernels_closures
+from kinefit.solving.rows import DofRows
+
+HARD_SIGMA = 1e-4
+"""[m, rad] standard deviation of a hard closure in a quadratic cost; the solution is made exact afterwards."""
+
+_RIGID_PAIRS = 0.1 * np.concatenate([np.zeros((1, 3)), np.eye(3)])
+"""(4, 3) [m] from a rigid closure's landmark to the points of its segment that represent it: about a boot's width."""
+
+
+@dataclass(frozen=True, eq=False)
+class Closed:
+    """Closures of a body at a state: m equations c = 0.
+
+    Parameters
+    ----------
+    value : (m,) [m, rad] c, error of each equation.
+    jacobian : (m, n) of c by the degrees of freedom.
+    sigma : (m,) [m, rad] standard deviation, including that of unknown gear; 0 if it holds exactly.
+    """
+
+    value: NDArray
+    jacobian: NDArray
+    sigma: NDArray
+
+    @property
+    def hard(self) -> NDArray:
+        """Whether each equation (m,) holds exactly; bool."""
+        return self.sigma == 0.0
+
+    def chosen(self, some: NDArray) -> Closed:
+        """The equations selected by a mask or indices (k,)."""
+        return Closed(self.value[some], self.jacobian[some], self.sigma[some])
+
+    def rows(self, stiff: float = HARD_SIGMA) -> DofRows:
+        """All equations as rows; hard ones with the standard deviation `stiff` [m, rad]."""
+        weight = 1.0 / np.square(np.where(self.hard, stiff, self.sigma))
+        return DofRows(self.jacobian, -self.value, weight, np.full(len(weight), -1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """Closures of a body as arrays for `_kernels_closures.close`: K closures, m equations."""
+
+    segments: NDArray
+    rest: NDArray
+    directions: NDArray
+    first: NDArray
+    rigid: NDArray
+    turns: NDArray
+    owner: NDArray  # (m,) int
+    sigma: NDArray  # (m,)
+
+
+@lru_cache(maxsize=256)
+def _table(body: Body) -> _Table:
+    marks = body.landmarks
+    names, rest = {name: k for k, name in enumerate(marks.names)}, body.points_rest(marks)
+    segments, points, directions, sigma, turns = [], [], [np.zeros((0, 3))], list[float](), []
+    for c in body.closures:
+        a, b = names[c.point], names[c.to] if c.to else -1
+        segments.append((marks.segments[a], marks.segments[b] if c.to else -1))
+        points.append((rest[a], rest[b] if c.to else np.array(c.place)))
+        directions.append(c.directions)
+        sigma += [float(np.hypot(0.0 if c.hard else c.sigma, c.place_std))] * len(c.directions)
+        turns.append(se3.exp_so3(np.array(c.turn)))
+        if c.kind == "rigid":
+            directions.append(np.zeros((3, 3)))
+            sigma += [float(np.hypot(0.0 if c.hard else c.turn_sigma, c.turn_std))] * 3
+    counts = [c.rows for c in body.closures]
+    return _Table(
+        np.array(segments, np.int64).reshape(-1, 2), np.array(points, float).reshape(-1, 2, 3),
+        np.concatenate(directions), np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        np.array([c.kind == "rigid" for c in body.closures], bool), np.array(turns, float).reshape(-1, 3, 3),
+        np.repeat(np.arange(len(counts)), counts), np.array(sigma, float),
+    )  # fmt: skip
+
+
+def owners(body: Body) -> NDArray:
+    """Index (m,) of the closure of each equation."""
+    return _table(body).owner
+
+
+@lru_cache(maxsize=64)
+def _gear_sigma(body: Body) -> NDArray:
+    """Standard deviation (m,) of each equation by the unknown dimensions of gear, in the default posture."""
+    variance = np.zeros(len(_table(body).owner))
+    for d in body.dimensions:
+        if d.std > 0.0:
+            step = 0.1 * d.std
+            changed = [with_dimensions(body, {d.name: d.value + s * step}) for s in (1.0, -1.0)]
+            ends = [closure_values(b, body.default_state()) for b in changed]
+            variance += np.square((ends[0] - ends[1]) / (2.0 * step) * d.std)
+    out = np.sqrt(variance)
+    out[out < 1e-9] = 0.0
+    return out
+
+
+def closure_values(body: Body, state: BodyState) -> NDArray:
+    """Errors (m,) [m, rad] of all equations of a body's closures."""
+    return _closed(body, state, 0)[0]
+
+
+def _closed(body: Body, state: BodyState, lines: int) -> tuple[NDArray, NDArray]:
+    """Values (m,), and their Jacobian with `lines` rows: m or 0."""
+    t, tree = _table(body), body.tree
+    frames, screws = tree.forward(state.T_world_root, state.angles)
+    value, J = np.empty(len(t.owner)), np.zeros((lines, tree.n_dofs))
+    _kernels_closures.close(
+        frames, screws, np.ascontiguousarray(state.T_world_root[:3, 3]), t.segments, t.rest, t.directions, t.first,
+        t.rigid, t.turns, tree.dof_parent, tree.last_dof, value, J,
+    )  # fmt: skip
+    return value, J
+
+
+def closed_at(body: Body, state: BodyState) -> Closed:
+    """The closures of a body at a state."""
+    t = _table(body)
+    return Closed(*_closed(body, state, len(t.owner)), np.hypot(t.sigma, _gear_sigma(body)))
+
+
+def closure_rows(body: Body, state: BodyState) -> DofRows:
+    """Rows of all closures of a body, r = −c: soft ones with their standard deviation, hard ones with `HARD_SIGMA`."""
+    return closed_at(body, state).rows()
+
+
+def closure_targets(body: Body, state: BodyState) -> tuple[PointSet, NDArray]:
+    """Points of a body's closures and their targets, in the linearisation of the paper (P3 3.2, eqs. 18, 19).
+
+    A pair of points gives two: the target of each is the position of the other. A position in the world gives one, (18)
+    alone. A rigid closure gives four pairs, as for the paper's boot and binding.
+
+    Returns
+    -------
+    points : PointSet of K points.
+    x_world : (K, 3) [m], constant in a step.
+
+    Raises
+    ------
+    BodyError
+        A closure to a line or a plane, which the paper does not have; gear that is to be estimated.
+    """
+    if has_unknown_gear(body):
+        problem = f"body '{body.name}' has gear to estimate, which equations (18) and (19) cannot do"
+        raise BodyError(problem, remedy="Give `known_gear(body)`, with fixed dimensions and positions.")
+    points, x_world = [body.landmarks.select(())], [np.zeros((0, 3))]
+    for c in body.closures:
+        if c.kind not in ("point", "rigid"):
+            problem = f"closure '{c.name}' is a {c.kind}, not a pair of points as in equations (18) and (19)"
+            raise BodyError(problem, remedy='Write kind = "point" or "rigid", or take `closure_rows`.')
+        shifts = _RIGID_PAIRS if c.kind == "rigid" else _RIGID_PAIRS[:1]
+        turned = shifts @ se3.exp_so3(np.array(c.turn)).T
+        own = _shifted(body.landmarks, c.point, shifts)
+        if c.to:
+            other = _shifted(body.landmarks, c.to, turned)
+            points += [own, other]
+            x_world += [body.positions(state, other), body.positions(state, own)]
+        else:
+            points.append(own)
+            x_world.append(np.array(c.place) + turned)
+    joined = PointSet(
+        tuple(name for p in points for name in p.names), np.concatenate([p.segments for p in points]),
+        np.concatenate([p.points for p in points]),
+    )  # fmt: skip
+    return joined, np.concatenate(x_world)
+
+
+def _shifted(landmarks: PointSet, name: str, shifts: NDArray) -> PointSet:
+    """Points of a landmark's segment at offsets (k, 3) [m] from it."""
+    same = landmarks.select((name,) * len(shifts))
+    return PointSet(same.names, same.segments, same.points + shifts)
+
+
+def soft_closures(body: Body, state: BodyState) -> list[DofRows]:
+    """Rows of the soft closures, if there are any."""
+    if not body.closures:
+        return []
+    closed = closed_at(body, state)
+    soft = ~closed.hard
+    return [closed.chosen(soft).rows()] if soft.any() else []
+
+
+def every_closure(body: Body, state: BodyState) -> list[DofRows]:
+    """Rows of all closures, if there are any, for quadratic costs."""
+    return [closure_rows(body, state)] if body.closures else []
+
+
+@dataclass(frozen=True, eq=False)
+class HardEquations:
+    """The closure equations that hold exactly.
+
+    Parameters
+    ----------
+    body : Body
+    hard : (m,) bool, which of the body's equations hold exactly
+    """
+
+    body: Body
+    hard: NDArray
+
+    def __call__(self, state: BodyState) -> tuple[NDArray, NDArray]:
+        """Values (h,) [m, rad] and Jacobian (h, n) at a state."""
+        closed = closed_at(self.body, state)
+        return closed.value[self.hard], closed.jacobian[self.hard]
+
+
+def hard_equations(body: Body) -> HardEquations | None:
+    """Function of a state: values and Jacobian of the hard closures; None without hard closures."""
+    hard = np.hypot(_table(body).sigma, _gear_sigma(body)) == 0.0 if body.closures else np.zeros(0, bool)
+    return HardEquations(body, hard) if hard.any() else None
+
+
+@lru_cache(maxsize=64)
+def looped(body: Body) -> NDArray:
+    """Whether each coordinate (D,) is inside a closed chain, so that the others in it determine it; bool."""
+    out = np.zeros(body.tree.n_dofs, bool)
+    for a, b in _table(body).segments:
+        paths = []
+        for s in (a, b):
+            path = np.zeros(len(out), bool)
+            if s >= 0:
+                last = int(body.tree.last_dof[s])
+                path[body.tree.chain[last, : body.tree.depth[last] + 1]] = True
+            paths.append(path)
+        out |= paths[0] ^ paths[1]
+    return out[6:]

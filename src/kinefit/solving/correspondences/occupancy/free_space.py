@@ -1,0 +1,140 @@
+"""Free space: the body cannot be where a depth sensor measured something farther away."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera
+from kinefit.solving.correspondences import _kernels
+from kinefit.solving.correspondences.occupancy import _kernels_space as kernels
+from kinefit.solving.correspondences.occupancy.depth_image import SurfaceSamples
+from kinefit.solving.correspondences.targets import check_depth_image
+from kinefit.solving.rows import Rows
+
+GRID_COLUMNS = 160  # cells across the image: a person at 2 to 4 m is some 20 to 40 cells wide, at any resolution
+
+
+@dataclass(frozen=True, eq=False)
+class FreeSpace:
+    """A depth image with, for every cell of pixels, the nearest cell where the body can be.
+
+    Parameters
+    ----------
+    depth : (H, W) [m]
+        Along the optical axis; 0 where nothing was measured, negative where another object was.
+    nearest : (h, w) int32, row * w + column of that cell; -1 if the body cannot be in the image
+    missing : (h, w) int32, the same among the cells that the body's present pose does not explain; -1 for none
+    cell : int [px] width and height of a cell
+    """
+
+    depth: NDArray
+    nearest: NDArray
+    missing: NDArray
+    cell: int
+
+    @classmethod
+    def of(
+        cls,
+        depth: NDArray,
+        *,
+        farthest: float,
+        shown: NDArray | None = None,
+        tolerance: float = 0.1,
+        columns: int = GRID_COLUMNS,
+    ) -> FreeSpace:
+        """Free space of one depth image.
+
+        Parameters
+        ----------
+        depth : (H, W) [m]
+            0 where nothing was measured, negative where another object was.
+        farthest : float [m]
+            Largest depth of the body along the optical axis: the back of its predicted box. Nearer objects may occlude
+            it, so the body can be there.
+        shown : (h', w') [m], optional
+            The body's rendered depth in that camera at any size, inf for none. Cells that it explains within
+            `tolerance` [m] are excluded for the rest of the body: a misplaced limb then goes to where one is missing,
+            not to the nearer head or trunk. Leave it out only if the pose is nearly correct.
+        tolerance : float [m]
+        columns : int
+            Smallest number of cells across the image; more cost more and resolve contours better.
+
+        Raises
+        ------
+        ObservationError
+            No depth image, or a `farthest` that is not positive.
+        """
+        if np.ndim(depth) != 2 or not np.size(depth):
+            problem = f"a depth image has shape {np.shape(depth)}"
+            raise ObservationError(problem, remedy="Give (height, width) in metres.")
+        if not farthest > 0.0:
+            remedy = "Give it in metres along the optical axis."
+            raise ObservationError(f"the farthest point of the body is {farthest} m", remedy=remedy)
+        cell = max(depth.shape[1] // max(columns, 1), 1)
+        nearest, missing = np.full((2, -(-depth.shape[0] // cell), -(-depth.shape[1] // cell)), -1, np.int32)
+        kernels.nearest_cells(depth, farthest, cell, np.empty((0, 0), np.float32), tolerance, nearest)
+        if shown is not None:
+            own = np.ascontiguousarray(shown, np.float32)
+            kernels.nearest_cells(depth, farthest, cell, own, tolerance, missing)
+        return cls(depth, nearest, missing, cell)
+
+    def middle(self, cells: NDArray) -> NDArray:
+        """Centres (N, 2) [px] of cells (N,), given as row * w + column."""
+        row, column = np.divmod(np.asarray(cells), self.nearest.shape[1])
+        return np.stack([column, row], axis=1) * float(self.cell) + (0.5 * self.cell - 0.5)
+
+
+def free_space_rows(
+    frames: NDArray,
+    samples: SurfaceSamples,
+    space: FreeSpace,
+    camera: Camera,
+    *,
+    sigma: float | None = None,
+    tolerance: float = 0.1,
+    reach: float = 0.5,
+    chosen: NDArray | None = None,
+) -> Rows:
+    """One row for each sample in free space: sideways to the edge of the nearest possible cell.
+
+    With g = −∂(distance in the image)/∂x: n = g/|g|, r = distance/|g|, w = |g|²/σ², the exact linearisation, as in
+    `pixel_rows`. A sample makes no row if it faces away from the camera, or lies outside of its image, at a pixel
+    without measurement, or behind the measured surface.
+
+    Parameters
+    ----------
+    frames : (S, 12) of the segments: `body.tree.forward(state.T_world_root, state.angles)[0]`, or of joints that move.
+    samples : SurfaceSamples
+    space : FreeSpace of the camera's image
+    camera : Camera
+    sigma : float [px]
+        Default ten cells: adjacent samples are correlated, and the nearest cell is often not the correct one, so
+        measured points should dominate.
+    tolerance : float [m]
+        How far behind a sample a measurement must lie to contradict it: above three sigmas of the sensor plus the error
+        of a surface of simple shapes.
+    reach : float [m]
+        Largest sideways distance: farther away lies another part, or another person.
+    chosen : (N,) int64, optional
+        Output: the target cell of every sample, -1 for none; see `FreeSpace.middle`.
+
+    Raises
+    ------
+    ObservationError
+        An image of another size than the camera's, or a sigma that is not positive.
+    """
+    check_depth_image(space.depth, camera)
+    sigma = 10.0 * space.cell if sigma is None else sigma
+    if not sigma > 0:
+        raise ObservationError(f"the standard deviation of free space is {sigma} px", remedy="Give positive pixels.")
+    data, segment, group = _kernels.buffers(len(samples))
+    chosen = np.empty(len(samples), np.int64) if chosen is None else chosen
+    end = kernels.free_space_rows(
+        frames, samples.segment, samples.point, samples.normal, camera.packed, space.depth, space.nearest,
+        space.missing, space.cell, tolerance, reach, 1.0 / sigma**2, chosen, data, segment, group, 0,
+    )  # fmt: skip
+    return Rows(np.ascontiguousarray(data[:, :end]), segment[:end], group[:end])

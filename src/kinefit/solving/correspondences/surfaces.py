@@ -1,0 +1,99 @@
+"""Point to surface: a measured point should lie on the body, anywhere or on one segment (P2 2.3; P4, eq. 15)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit._arguments import shaped
+from kinefit.bodies import Body, BodyState
+from kinefit.bodies.surfaces import Metaballs
+from kinefit.bodies.surfaces.metaballs import LEVEL
+from kinefit.bodies.surfaces.places import nearest_lines
+from kinefit.solving.correspondences import _kernels, targets
+from kinefit.solving.correspondences._kernels_surface import surface_rows as fill
+from kinefit.solving.rows import Rows
+
+
+def surface_rows(
+    body: Body,
+    state: BodyState,
+    x_world: ArrayLike,
+    *,
+    max_distance: float = 0.1,
+    sigma: ArrayLike = 0.01,
+    segment: ArrayLike | None = None,
+    viewpoint: ArrayLike | None = None,
+    exact: bool = False,
+    frames: NDArray | None = None,
+) -> Rows:
+    """One row for each point x: the surface's nearest point p = x − d n should lie d further along its normal n.
+
+    This is point-to-plane along the model's normal: sliding of the nearest point on the surface has no cost.
+
+    Parameters
+    ----------
+    x_world : (N, 3) [m]
+        Measured points; NaN for none. The rows' `group` is the index of the point.
+    max_distance : float [m], largest distance of a point with a row.
+    sigma : scalar or (N,) [m]
+    segment : (N,) int, or one for all, optional
+        Segment of each point if known, -1 for any.
+    viewpoint : (3,) [m], optional
+        Position of the sensor: points whose nearest surface faces away from it make no row.
+    exact : bool
+        See `nearest`.
+    frames : (S, 12), optional, for a body whose joints move with its angles.
+
+    Raises
+    ------
+    ObservationError
+        As `nearest`; a viewpoint that is no point.
+    """
+    x = shaped(x_world, ("N", 3), "points on surfaces")
+    present = np.isfinite(x).all(axis=1)
+    weight = targets.weights(sigma, present, "points on surfaces")
+    eye, min_facing = np.zeros(3), -np.inf
+    if viewpoint is not None:
+        eye, min_facing = shaped(viewpoint, (3,), "a viewpoint", finite=True), 0.0
+    frames = targets.of_segments(body, state, frames)
+    lines = targets.lines(x)
+    distance, normal, owner = nearest_lines(body, frames, lines, max_distance, segment, exact=exact)
+    data, owners, group = _kernels.buffers(len(x))
+    count = fill(lines, distance, normal, owner, weight, eye, min_facing, data, owners, group)
+    return Rows(np.ascontiguousarray(data[:, :count]), owners[:count], group[:count])
+
+
+def field_rows(
+    body: Body, state: BodyState, x_world: ArrayLike, segment: ArrayLike, *, sigma: ArrayLike = 1.0
+) -> Rows:
+    """One row for each point: the field F of its segment's metaballs should be 1/2, r = F − 1/2 (P4, eqs. 14 and 15).
+
+    A segment that moves by δ along the gradient n = ∇F lowers F at the point by n·δ. So n is in [1/m], not a unit
+    vector, and r has no unit. Derivatives are exact.
+
+    Parameters
+    ----------
+    x_world : (N, 3) [m]
+        Measured points; NaN for none. The rows' `group` is the index of the point.
+    segment : (N,) int, or one for all
+        Segment of each point; a point of a segment without metaballs, or of -1, makes no row.
+    sigma : scalar or (N,), no unit
+        Standard deviation of F at each point.
+
+    Raises
+    ------
+    ObservationError
+        Points or standard deviations of the wrong shape.
+    """
+    x, present = targets.array(x_world, 3, len(np.asarray(x_world)), "points in fields")
+    weight, owner = targets.weights(sigma, present, "points in fields"), np.broadcast_to(segment, len(x))
+    frames, slope, residual = targets.of_segments(body, state), np.zeros(x.shape), np.full(len(x), np.nan)
+    for limb in body.surfaces:
+        if isinstance(limb, Metaballs):
+            f, own = frames[limb.segment], present & (owner == limb.segment)
+            R = f[:9].reshape(3, 3)
+            d = limb.derivatives((x[own] - f[9:]) @ R - body.tree.rest[limb.segment])
+            slope[own], residual[own] = d.by_point @ R.T, d.value - LEVEL
+    used = np.flatnonzero(np.isfinite(residual))
+    return Rows.of(owner[used], x[used], slope[used], residual[used], weight[used], used)

@@ -1,0 +1,314 @@
+"""The built-in detector over videos: side by side, kept, not done twice."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from glob import escape
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from kinefit._files import regular
+from kinefit._threads import cores
+from kinefit.errors import AssetError, FileError, TakeError
+from kinefit.takes.preparing.each_video import Step, Tell, each_video, video_key
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from kinefit.readers.take.entries import CameraEntry
+    from kinefit.readers.take.file import Take
+    from kinefit.readers.videos.video import Video
+
+PEOPLE = 3
+"""How many people are followed at most in one camera, by default."""
+
+QUALITIES = {"balanced": "pose_landmark_full.tflite", "best": "pose_landmark_heavy.tflite"}
+"""Landmark networks: the larger, the nearer to the joints, and the slower."""
+
+QUALITY = "best"
+"""Of new detections, where none is asked for."""
+
+_METHOD = "3"  # raise it when the detector gives other numbers for the same video
+
+
+@dataclass(frozen=True)
+class DetectionJob:
+    """One video to look through.
+
+    Parameters
+    ----------
+    camera : str
+    video : Path
+    file : Path
+        Of the detections.
+    rate : float [Hz], optional
+        Of a video that is a folder of images.
+    seconds : (start, stop) [s] of the video that are looked through; default: all of it
+    """
+
+    camera: str
+    video: Path
+    file: Path
+    rate: float | None = None
+    seconds: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class DetectionSettings:
+    """What is detected; None: as in a file of detections that is there, else the default.
+
+    Parameters
+    ----------
+    people : int
+        Largest number at a time; default: `PEOPLE`.
+    masks, hands, face : bool
+        Whether these are detected too; default: no.
+    quality : str or Path
+        One of `QUALITIES`, or the file of a landmark network of one's own; default: `QUALITY`.
+    """
+
+    people: int | None = None
+    masks: bool | None = None
+    hands: bool | None = None
+    face: bool | None = None
+    quality: str | Path | None = None
+
+
+DEFAULT_SETTINGS = DetectionSettings()
+
+
+@dataclass(frozen=True)
+class Networks:
+    """Files of the detector's networks.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the network that finds people.
+    landmarks : Path
+        The network that sees their landmarks.
+    name : str
+        Of its quality, or what tells a file of one's own from others.
+    mirrored : bool
+        Whether each crop is looked at a second time, mirrored.
+    """
+
+    folder: Path
+    landmarks: Path
+    name: str
+    mirrored: bool = False
+
+
+def jobs_of_take(take: Take) -> list[DetectionJob]:
+    """Every camera of a take that has a video; TakeError where none has."""
+    from kinefit.readers.landmarks.detections import detections_file
+
+    rate = _rate(take) if take.frames else 0.0
+    found = [
+        DetectionJob(c.name, c.video, detections_file(take.path, c.name), take.rate, _seconds(take, c, rate))
+        for c in take.cameras if c.video is not None
+    ]  # fmt: skip
+    if not found:
+        raise TakeError(
+            "no camera of the take has a video", file=take.path, remedy='Add video = "..." to its [[camera]] entries.'
+        )
+    return found
+
+
+def _rate(take: Take) -> float:
+    """Rate [Hz] of a take's steps: its own, or the highest of its videos'."""
+    from kinefit.readers.videos.video import Video
+
+    rates = [take.rate or 0.0]
+    for camera in take.cameras if take.rate is None else ():
+        if camera.video is not None:
+            with Video(camera.video) as video:
+                rates.append(video.rate)
+    return max(rates)
+
+
+def _seconds(take: Take, camera: CameraEntry, rate: float) -> tuple[float, float] | None:
+    """Of a camera's video that lie in the take's frames, a step more at both ends."""
+    if take.frames is None:
+        return None
+    start, stop = take.frames
+    return (start - 1) / rate - camera.time_offset, (stop + 1) / rate - camera.time_offset
+
+
+def detect(
+    jobs: Sequence[DetectionJob], settings: DetectionSettings = DEFAULT_SETTINGS, *, force: bool = False,
+    progress: Step | None = None, tell: Tell,
+) -> list[DetectionJob]:  # fmt: skip
+    """Look through the videos whose file is not there yet, or is of another video or other settings; returns these.
+
+    Every file is written as soon as its video is done, so that what was interrupted goes on with the others.
+    """
+    from kinefit.images.detectors.box_detector import Models
+    from kinefit.readers.landmarks.detections import detections_key
+
+    keys = {job: detection_key(job) for job in jobs}
+    wanted = {**asdict(settings), "quality": settings.quality and _name_of(settings.quality)}
+    if not force:
+        for job in jobs:
+            _from_beside(job, keys[job], wanted)
+    todo = [job for job in jobs if force or not _fits(detections_key(job.file), keys[job], wanted, job.seconds)]
+    if not todo:
+        return []
+    files = networks(progress, tell, settings.quality or QUALITY)
+    if files.name == "best" and len(jobs) == 1:  # depths of one camera gain by it; several give the same motion
+        files = replace(files, mirrored=True)
+    s = settings
+    full = DetectionSettings(PEOPLE if s.people is None else s.people, bool(s.masks), bool(s.hands), bool(s.face))
+    threads = max(cores() // len(todo), 1)  # cameras run side by side; what cores are left help them
+
+    def work(job: DetectionJob, step: Step) -> None:
+        key = f"{keys[job]} {_settings(full, job.seconds)}"
+        key += f"{' mirrored=True' * files.mirrored} quality={files.name}"
+        _look_through(job, files, full, key, step, threads)
+
+    with hushed():
+        Models(files.folder, landmarks=files.landmarks)
+    each_video(todo, work, progress, of=len(jobs))
+    return todo
+
+
+def _from_beside(job: DetectionJob, key: str, wanted: Mapping[str, object]) -> None:
+    """Copy what another take of the same folder found in the same video already."""
+    from kinefit._files import writing
+    from kinefit.readers.landmarks.detections import detections_key
+
+    if _fits(detections_key(job.file), key, wanted, job.seconds):
+        return
+    for other in sorted(job.file.parent.parent.glob(f"*-detect/{escape(job.file.name)}")):
+        if _fits(detections_key(other), key, wanted, job.seconds):
+            with writing(job.file) as temporary:
+                shutil.copyfile(other, temporary)
+            return
+
+
+def seconds_of(job: DetectionJob, video: Video) -> tuple[int, int]:
+    """Frames (first, stop) of a video that are looked through."""
+    if job.seconds is None:
+        return 0, len(video)
+    first, stop = (int(k) for k in np.searchsorted(video.times, np.array(job.seconds) - 1e-6))
+    return first, stop
+
+
+def _look_through(
+    job: DetectionJob, files: Networks, settings: DetectionSettings, key: str, tell: Step, threads: int
+) -> None:
+    from kinefit.exporters.motion_file import write_detections
+    from kinefit.images.detectors.box_detector import Models
+    from kinefit.images.detectors.detection import detect_people
+    from kinefit.images.detectors.faces import FaceFinder, FaceModels, HandFollower, HandModels
+    from kinefit.readers.videos.video import Video
+
+    models = Models(files.folder, threads, files.landmarks, mirrored=files.mirrored)
+    with Video(job.video, rate=job.rate) as video:
+        first, last = seconds_of(job, video)
+
+        def counted(images: Iterable[NDArray]) -> Iterator[NDArray]:
+            for number, image in enumerate(images):
+                tell(job.camera, number, last - first)
+                yield image
+            tell(job.camera, last - first, last - first)
+
+        found = detect_people(
+            counted(video.frames(first, last)), models, camera=job.camera, rate=video.rate,
+            people=settings.people or 0, masks=bool(settings.masks),
+            with_hands=HandFollower(HandModels(files.folder, threads)) if settings.hands else None,
+            with_faces=FaceFinder(FaceModels(files.folder, threads)) if settings.face else None,
+        )  # fmt: skip
+        times = video.times if video.unevenness else None
+        found = replace(found.within(first, len(video)), times=times, source=str(job.video))
+    write_detections(found, job.file, key=key)
+
+
+def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced") -> Networks:
+    """The networks of a quality, or with a landmark network of one's own; their licence is shown as they are fetched.
+
+    Where the large one cannot be fetched, that of "balanced", which comes with the one that finds people, stands in for
+    it, and says so.
+    """
+    from kinefit.images.detectors.box_detector import LANDMARKS, check_runtime
+    from kinefit.readers.assets import MODELS_CREDIT, detector_models, landmark_models
+
+    check_runtime()
+    fetched: list[int] = []
+
+    def report(done: int, total: int) -> None:
+        if not fetched:
+            tell(f"Downloading the networks of the built-in detector, once: {MODELS_CREDIT}.")
+        fetched.append(done)
+        if progress:
+            progress("download MB", done // 10**6, total // 10**6)
+
+    folder = detector_models(report)
+    if isinstance(quality, Path):
+        return Networks(folder, quality, _name_of(quality))
+    if QUALITIES[quality] == LANDMARKS:
+        return Networks(folder, folder / LANDMARKS, quality)
+    try:
+        return Networks(folder, landmark_models(report) / QUALITIES[quality], quality)
+    except AssetError as error:
+        tell(f"{error} Until then, the network of quality 'balanced' is used.")
+        return Networks(folder, folder / LANDMARKS, "balanced")
+
+
+def _name_of(quality: str | Path) -> str:
+    """Name that distinguishes results by quality, or by the network's file."""
+    if isinstance(quality, str):
+        return quality
+    try:
+        return hashlib.sha256(regular(quality).read_bytes()).hexdigest()[:16]
+    except OSError as error:
+        raise FileError(f"cannot be read ({error.strerror})", file=quality, remedy="Check --network.") from error
+
+
+def detection_key(job: DetectionJob) -> str:
+    """Begin of the key of a video's detections: text that another video, or another detector, does not have."""
+    from kinefit.readers.assets import MODELS_PACKAGE
+
+    return video_key(job.video, job.rate, f"{MODELS_PACKAGE} {_METHOD}")
+
+
+def _settings(s: DetectionSettings, seconds: tuple[float, float] | None) -> str:
+    part = "" if seconds is None else " seconds={}:{}".format(*seconds)
+    return f"people={s.people} masks={s.masks}{' hands=True' * bool(s.hands)}{' face=True' * bool(s.face)}{part}"
+
+
+def _fits(
+    found: str | None, key: str, wanted: Mapping[str, object], seconds: tuple[float, float] | None
+) -> bool:
+    """Whether what was found is of this video and of the settings that matter, those that are not None."""
+    if found is None or not found.startswith(key + " "):
+        return False
+    stated = dict(part.split("=") for part in found[len(key) + 1 :].split())
+    settings = {"quality": "balanced", "hands": "False", "face": "False", **stated}
+    first, last = (float(s) for s in settings.get("seconds", "-inf:inf").split(":"))
+    start, stop = seconds or (-np.inf, np.inf)
+    if not first <= start <= stop <= last:
+        return False
+    return all(value is None or settings.get(name) == str(value) for name, value in wanted.items())
+
+
+@contextmanager
+def hushed() -> Iterator[None]:
+    """Discard what LiteRT writes to stderr outside of Python: a message on how it runs, amid the progress."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)

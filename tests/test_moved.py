@@ -1,0 +1,38 @@
+"""Paths of version 0.2 lead to where the modules are, with a warning."""
+
+from importlib import import_module
+from importlib.util import find_spec
+
+import pytest
+
+import kinefit
+from kinefit._moved import MOVED, moved
+
+
+@pytest.mark.parametrize("old", MOVED)
+def test_every_old_path_leads_to_a_module(old):
+    assert find_spec(moved(f"kinefit.{old}"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("motion", "bodies.motion"), ("calibration.board.calibrate", "rigs.board.calibrate"),
+     ("markers.subject", "fitting.markers.subject"), ("readers.keypoints", "readers.landmarks.keypoints")],
+)  # fmt: skip
+def test_a_module_is_one_under_both_names(old, new):
+    with pytest.warns(DeprecationWarning, match=f"kinefit.{new} now"):
+        module = import_module(f"kinefit.{old}")
+    assert module is import_module(f"kinefit.{new}") and module.__spec__.name == f"kinefit.{new}"
+
+
+def test_rooms_of_old_are_attributes():
+    with pytest.warns(DeprecationWarning, match="kinefit.papers now"):
+        assert kinefit.recipes is import_module("kinefit.papers")
+
+
+def test_what_never_was_is_no_module():
+    with pytest.raises(ModuleNotFoundError):
+        import_module("kinefit.nothing")
+    with pytest.raises(ModuleNotFoundError, match="nothing"), pytest.warns(DeprecationWarning):
+        import_module("kinefit.tracking.nothing")
+    assert not moved("kinefit.markers")  # the room of that name
