@@ -1,5 +1,7 @@
 """`docs/figures.md`, made of the log and of what `docs/figures.toml` says of it: `python -m benchmarks.page` writes it.
 
+The values of the pages on the papers are written, too.
+
 A subject of the page takes the figures whose command begins with one of its `runs`. Figures whose names begin alike
 share a row of its table, in which each has a line of its own; a run that all of them have in common stands once.
 """
@@ -16,6 +18,7 @@ from typing import Any
 
 from benchmarks.figures import ROOT
 from benchmarks.ledger import BEFORE, LOG, Record, read
+from benchmarks.papers.papers_rows import fill
 
 PAGE, WORDS = ROOT / "docs" / "figures.md", ROOT / "docs" / "figures.toml"
 OLD = timedelta(weeks=4)
@@ -165,3 +168,4 @@ def written() -> str:
 
 if __name__ == "__main__":
     PAGE.write_text(written(), "utf-8")
+    fill()

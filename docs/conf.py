@@ -19,7 +19,7 @@ html_theme = "furo"
 html_title = f"kinefit {release}"
 
 myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
-myst_heading_anchors = 3
+myst_heading_anchors = 4
 
 default_role = "literal"  # `name` in a docstring is code
 suppress_warnings = ["ref.python"]  # "(K,) names" in a docstring are words: several classes have one of that name

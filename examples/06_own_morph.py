@@ -50,7 +50,7 @@ def main(picture=None, seed=0):
 
     errors = {}
     for name, body in (("morphing", model), ("rigid", rigid)):
-        state = arm.usual_state()
+        state = arm.default_state()
         for _ in range(20):
             pose = body.pose(state)
             gap = np.sum(axes * (seen - pose.vertices[nodes]), axis=1)

@@ -171,7 +171,7 @@ def figure():
 
 def test_a_body_shows_the_segments_where_they_are(figure):
     body, camera = figure
-    state = body.usual_state()
+    state = body.default_state()
     raster = render_body(body, state, camera, mesh=Balls(body))
     frames, _ = body.tree.forward(state.T_world_root, state.angles)
     joints = np.array([f[:9].reshape(3, 3) @ rest + f[9:] for f, rest in zip(frames, body.tree.rest)])
@@ -183,7 +183,7 @@ def test_a_body_shows_the_segments_where_they_are(figure):
 
 def test_a_smaller_image_shows_the_same(figure):
     body, camera = figure
-    mesh, state = Balls(body), body.usual_state()
+    mesh, state = Balls(body), body.default_state()
     small = render_body(body, state, camera, mesh=mesh, scale=0.25)
     assert small.face.shape == (30, 40)
     assert small.seen.mean() == pytest.approx(render_body(body, state, camera, mesh=mesh).seen.mean(), abs=0.005)
@@ -235,8 +235,8 @@ def test_what_cannot_be_drawn_is_refused(change, word):
 def test_a_canvas_of_another_size_is_refused(figure):
     body, camera = figure
     with pytest.raises(ObservationError, match="canvas"):
-        render_body(body, body.usual_state(), camera, mesh=Balls(body), canvas=Canvas((8, 8)))
+        render_body(body, body.default_state(), camera, mesh=Balls(body), canvas=Canvas((8, 8)))
     with pytest.raises(ObservationError, match="scaled"):
-        render_body(body, body.usual_state(), camera, mesh=Balls(body), scale=0.0)
+        render_body(body, body.default_state(), camera, mesh=Balls(body), scale=0.0)
     with pytest.raises(ObservationError, match="labels"):
         _ = rasterise([[0, 0, 1], [1, 0, 1], [0, 1, 1.0]], [[0, 1, 2]], LENS, SIZE).segment

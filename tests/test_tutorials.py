@@ -7,25 +7,26 @@ import sys
 
 import pytest
 from tests.conftest import ROOT
+from tests.docs.blocks import PARTS, part_text
 
-PAGES = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+TUTORIALS = [part for part, (page, _) in PARTS.items() if page == "tutorials"]
 BLOCK = re.compile(r"^```(bash|python|text)\n(.*?)^```", re.M | re.S)
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 WALK = "motion_cmu_bvh/cmu_12_01_walk.bvh"
 
 
-def blocks(page):
-    return BLOCK.findall(page.read_text(encoding="utf-8"))
+def blocks(part):
+    return BLOCK.findall(part_text(part))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p)], ids=lambda p: p.stem)
-def test_a_tutorial_runs_as_it_stands(page, tmp_path, request):
+@pytest.mark.parametrize("part", TUTORIALS)
+def test_a_tutorial_runs_as_it_stands(part, tmp_path, request):
     tool = tmp_path / "bin" / "kinefit"
     tool.parent.mkdir()
     tool.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m kinefit "$@"\n')
     tool.chmod(0o755)
-    if "curl " in page.read_text(encoding="utf-8"):  # in place of the network: the same file, which was fetched before
+    if "curl " in part_text(part):  # in place of the network: the same file, which was fetched before
         kept = request.getfixturevalue("data_dir")(WALK.partition("/")[0]).parent / WALK
         fetch = tool.with_name("curl")
         fetch.write_text(f'#!/bin/sh\ncase "$4" in */{kept.name}) cp "{kept}" "$3";; *) exit 22;; esac\n')
@@ -34,7 +35,7 @@ def test_a_tutorial_runs_as_it_stands(page, tmp_path, request):
     work.mkdir()
     environment = {**os.environ, "PATH": f"{tool.parent}{os.pathsep}{os.environ['PATH']}"}
     python, printed = "", []
-    for kind, text in blocks(page):
+    for kind, text in blocks(part):
         if kind == "text":
             told = printed[-len(text.splitlines()) :]
             assert [NUMBER.sub("#", line) for line in told] == [NUMBER.sub("#", line) for line in text.splitlines()]
@@ -48,6 +49,7 @@ def test_a_tutorial_runs_as_it_stands(page, tmp_path, request):
         printed = done.stdout.splitlines()
 
 
-def test_tutorials_are_all_in_their_index():
-    index = (ROOT / "docs" / "tutorials" / "index.md").read_text(encoding="utf-8")
-    assert {p.stem for p in PAGES} - {"index"} <= set(index.split())
+def test_every_tutorial_of_the_page_is_run():
+    headings = re.findall(r"^## (.*)$", (ROOT / "docs" / "tutorials.md").read_text("utf-8"), re.M)
+    assert sorted(headings) == sorted(heading for page, heading in PARTS.values() if page == "tutorials")
+    assert all(blocks(part) for part in TUTORIALS)

@@ -1,4 +1,4 @@
-"""The pictures of `docs/recipes/regions.md` and `docs/recipes/metaballs.md`.
+"""The pictures of `docs/papers/p3.md` and `docs/papers/p4.md`.
 
     python -m benchmarks.papers.recipe_pictures
 """

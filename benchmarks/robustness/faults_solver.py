@@ -34,7 +34,7 @@ def run() -> None:
     body, points, x = beyond_limits(amount(1200, 400))
     count = 0
     for name, settings in SETTINGS.items():
-        found = fit_sequence(body, body.usual_state(), points, x, **settings)
+        found = fit_sequence(body, body.default_state(), points, x, **settings)
         active = np.mean((found.angles <= body.tree.lower) | (found.angles >= body.tree.upper))
         gain = second_call(body, points, x, found.Ts_world_root, found.angles, **settings)
         count += int(np.sum(gain > MAX_GAIN))

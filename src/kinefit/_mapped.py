@@ -1,4 +1,4 @@
-"""Large arrays that need no memory while nobody looks at them: they lie in temporary files without names."""
+"""Large arrays in unnamed temporary files: they need memory only while they are used."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ class Finding:
 
 
 def faults_of(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Those that spoil results, each said once."""
+    """Findings that spoil results, without repetitions."""
     return tuple(dict.fromkeys(found for found in findings if found.severity == "fault"))
 
 

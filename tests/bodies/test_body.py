@@ -47,6 +47,10 @@ def test_degrees_of_freedom_have_names():
     assert len(set(HUMANOID.dof_names)) == HUMANOID.tree.n_dofs
 
 
+def test_the_default_state_has_its_old_name_too():
+    assert np.array_equal(HUMANOID.usual_state().angles, HUMANOID.default_state().angles)
+
+
 def test_the_rest_state_is_within_the_limits():
     state = HUMANOID.rest_state(se3.exp(np.arange(6.0)))
     assert np.all(state.angles >= HUMANOID.tree.lower) and np.all(state.angles <= HUMANOID.tree.upper)

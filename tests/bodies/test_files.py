@@ -75,7 +75,7 @@ def test_the_usual_posture():
     np.testing.assert_allclose(
         body.tree.usual, [np.radians(-30), np.radians(10), 0.1]
     )  # zero, or what is nearest to it
-    np.testing.assert_array_equal(body.usual_state().angles, body.tree.usual)
+    np.testing.assert_array_equal(body.default_state().angles, body.tree.usual)
 
 
 def test_joints_move_as_their_axes_say():

@@ -36,9 +36,12 @@ NOT_RUN = {
     ("live", "kinefit live studio.toml"): "needs two cameras; tests/live has some that pretend",
     ("index", "kinefit demo"): "fetches a recording; tests/cli/tracking/test_demo.py runs it with that",
     ("install", ""): "makes an environment and installs into it, as README's commands do",
-    ("telephones", ""): "needs videos of a real person; tests/calibration/people goes this way with a recording",
+    (
+        "several-telephones",
+        "",
+    ): "needs videos of a person; tests/calibration/people goes this way with a recording",
     ("one-camera", ""): "needs a video of a real person; tests/cli/test_init.py goes this way with a recording",
-    ("recipes/silhouettes", "kinefit track"): "shows one camera of four; tests/tracking/test_kinds.py has such takes",
+    ("silhouettes", "kinefit track"): "shows one camera of four; tests/tracking/test_kinds.py has such takes",
     ("regions", "kinefit track"): "needs video and mesh of one object; tests/tracking/test_kinds.py has such takes",
     ("surfaces", "kinefit surface calib.toml a=a.mp4"): "minutes; tests/cli/surfaces/test_surface.py follows videos",
     ("surfaces", "kinefit surface calib.toml left=left.mp4"): "the same",
@@ -48,14 +51,14 @@ NOT_RUN = {
     ("simulate", "kinefit track"): "the same",
     ("which-setup", "kinefit track"): "the same",
     ("view", "kinefit replay my_take-kinefit"): "needs a video; tests/simulation/test_replay.py draws beside one",
-    ("recipes/voodoo", "kinefit evaluate"): "minutes to an hour; tests/evaluation/test_experiment.py runs a part",
+    ("printed-voodoo", "kinefit evaluate"): "minutes to an hour; tests/evaluation/test_experiment.py runs a part",
 }
-"""{(page, how a line begins): why it is not run}; of `install`, `one-camera` and `telephones` nothing is."""
+"""{(page, how a line begins): why it is not run}; of `install`, `one-camera` and `several-telephones` nothing is."""
 
 ADDED = {"view": ["--html", "scene.html"], "live": ["--port", "0"]}
 """{command: what is added, so that it ends by itself and takes no fixed port}."""
 
-SLOW = {"batch", "calibration", "comparison", "first-recording", "recipes/depth-fusion", "sensors", "simulate",
+SLOW = {"batch", "calibration", "comparison", "first-recording", "depth", "sensors", "simulate",
         "surfaces", "which-setup"}  # fmt: skip
 """Pages whose commands take more than a few seconds."""
 
@@ -128,7 +131,7 @@ def init(folder):
 
 def depth_fusion(folder):
     """Files of the names that the page's own take has."""
-    (folder / "take.toml").write_text(blocks("recipes/depth-fusion", "toml")[0].text)
+    (folder / "take.toml").write_text(blocks("depth", "toml")[0].text)
     w = world()
     colour = replace(w.colour, name="colour")
     motion = cut(w.motion, 0, 6)
@@ -193,9 +196,9 @@ PREPARED = {
     "README": nothing, "app": nothing, "batch": batch, "blender": blender, "calibration": calibration, "check": take,
     "closed-chains": nothing, "comparison": comparison, "detect": nothing, "first-recording": first_recording,
     "index": nothing, "init": init, "install": nothing, "live": take, "one-camera": nothing,
-    "recipes/depth-fusion": depth_fusion, "recipes/silhouettes": nothing,
-    "recipes/sapm": sapm, "regions": nothing, "sensors": walk, "simulate": simulate, "surfaces": surfaces,
-    "telephones": nothing, "view": motion, "recipes/voodoo": nothing, "which-setup": which_setup,
+    "depth": depth_fusion, "silhouettes": nothing,
+    "printed-sapm": sapm, "regions": nothing, "sensors": walk, "simulate": simulate, "surfaces": surfaces,
+    "several-telephones": nothing, "view": motion, "printed-voodoo": nothing, "which-setup": which_setup,
 }  # fmt: skip
 """{page: its function}."""
 

@@ -29,8 +29,10 @@ def anny(folder):
     space = yield {"rig": w.rig}
     model = space["model"]
     body = model.body(model.of_stature(1.8))
-    states = [body.usual_state()] * 2
-    yield {"rig": w.rig, "steps": pixels(body, states, w.rig), "states": states}
+    states = [body.default_state()] * 2
+    assert load_body("person.npz").skin is not None
+    space = yield {"rig": w.rig, "steps": pixels(body, states, w.rig), "states": states}
+    assert space["found"].value("anny gender")[1] > 0.0
 
 
 def batch(folder):
@@ -96,7 +98,7 @@ def morphing(folder):
     man = skinned.body
     target = np.array(skinned.mesh.vertices) * (1.0, 1.0, 1.1)
     yield {"man": man, "target": target, "local_morphs": (), "arm": body}
-    yield {"state": man.usual_state(), "nodes": np.arange(3), "directions": np.tile((0.0, 1.0, 0.0), (3, 1))}
+    yield {"state": man.default_state(), "nodes": np.arange(3), "directions": np.tile((0.0, 1.0, 0.0), (3, 1))}
 
 
 def motion(folder):
@@ -212,7 +214,7 @@ def stereo(folder):
     space = yield {"rig": rig, "left_image": left, "right_image": right, "time": 0.0}
     assert np.isfinite(space["frame"].depth).any()
     body = load_body("humanoid")
-    yield {"body": body, "state": body.usual_state()}
+    yield {"body": body, "state": body.default_state()}
 
 
 def surfaces(folder):
@@ -250,7 +252,7 @@ def view(folder):
 def voodoo(folder):
     w = world()
     body = load_body("humanoid10")
-    start = body.usual_state()
+    start = body.default_state()
     x = drawn.skin_points(body, start)
     stream = [[PointCloud("tof", 0.0, x)]]
     yield {"stream": stream, "body": body, "start": start, "rig": Rig((w.depth_camera,))}
@@ -261,12 +263,12 @@ def voodoo(folder):
 PREPARED = {
     "anny": anny, "batch": batch, "calibration": calibration, "check": check, "depth-start": depth_start,
     "files": files, "live": live, "marker-fitting": marker_fitting, "markers": markers, "morphing": morphing,
-    "motion": motion, "own-sensor": own_sensor, "recipes/depth-fusion": depth_fusion,
-    "recipes/metaballs": printed_metaballs, "recipes/regions": printed_regions, "regions": regions,
-    "report": report, "rows": rows, "recipes/sapm": sapm, "recipes/silhouettes": silhouettes, "simulate": simulate,
+    "motion": motion, "own-sensor": own_sensor, "depth": depth_fusion,
+    "printed-metaballs": printed_metaballs, "printed-regions": printed_regions, "regions": regions,
+    "report": report, "rows": rows, "printed-sapm": sapm, "silhouettes": silhouettes, "simulate": simulate,
     "smoothing": smoothing, "solvers": solvers, "stereo": stereo, "surfaces": surfaces, "take-file": take_file,
     "view": view,
-    "recipes/voodoo": voodoo,
+    "printed-voodoo": voodoo,
 }  # fmt: skip
 """{page: its function}."""
 
@@ -276,5 +278,5 @@ AFTER = {"live": ("follow('take.toml')",)}
 NETWORK = {"anny"}
 """Pages whose blocks fetch a pinned package."""
 
-SLOW = {"anny", "batch", "calibration", "recipes/depth-fusion", "recipes/silhouettes"}
+SLOW = {"anny", "batch", "calibration", "depth", "silhouettes"}
 """Pages that take more than a few seconds."""

@@ -7,12 +7,12 @@ import sys
 
 import pytest
 from click.testing import CliRunner
-from tests.docs.blocks import PAGES, blocks, pages
+from tests.docs.blocks import PAGES, PARTS, blocks, pages
 from tests.docs.command_pages import ADDED, NOT_RUN, PREPARED, RECORDED, SLOW, reason
 
 from kinefit.cli import main
 
-RUN = [page for page in pages("bash") if not page.startswith("tutorials/")]  # those: tests/test_tutorials.py
+RUN = [page for page in pages("bash") if PARTS.get(page, [""])[0] != "tutorials"]  # those: tests/test_tutorials.py
 
 
 def lines(text):

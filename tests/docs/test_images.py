@@ -7,7 +7,7 @@ import sys
 import pytest
 from benchmarks.areas import AREAS
 from tests.conftest import ROOT
-from tests.docs.blocks import PAGES
+from tests.docs.blocks import PAGES, PARTS, part_text
 
 IMAGES = ROOT / "docs" / "images"
 
@@ -52,6 +52,6 @@ def test_every_image_is_shown():
 
 
 def test_tutorials_begin_with_an_image():
-    for page, path in PAGES.items():
-        if page.startswith("tutorials/") and page != "tutorials/index":
-            assert "](../images/" in path.read_text("utf-8").partition("\n```")[0], page
+    for part, (page, _) in PARTS.items():
+        if page == "tutorials":
+            assert "](images/" in part_text(part).partition("\n```")[0], part

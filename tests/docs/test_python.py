@@ -1,12 +1,12 @@
 """Every Python block of the pages runs, in order, with the names and files that its page takes for granted."""
 
 import pytest
-from tests.docs.blocks import PAGES, blocks, pages
+from tests.docs.blocks import PAGES, PARTS, blocks, pages
 from tests.docs.python_pages import AFTER, NETWORK, PREPARED, SLOW
 
 ELSEWHERE = {
-    "cga": "its examples are run, and their results compared, by tests/geometry/test_cga_docs.py",
-    **{page: "tests/test_tutorials.py runs them whole" for page in PAGES if page.startswith("tutorials/")},
+    "printed-cga": "its examples are run, and their results compared, by tests/geometry/test_cga_docs.py",
+    **{part: "tests/test_tutorials.py runs them whole" for part, (page, _) in PARTS.items() if page == "tutorials"},
 }
 """{page: where its blocks are run}."""
 

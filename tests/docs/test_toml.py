@@ -93,7 +93,7 @@ def test_a_block_is_read_by_what_reads_such_files(page, tmp_path):
     [
         ('[[depth]]\nname = "a"\nfile = "a.npz"\nrnage = [0, 1]\n', "rnage"),
         ('[[lines]]\ncamera = "cam02"\nfile = "a.csv"\nlandmarks = { a = ["r_wrist"] }\n', "cam02"),
-        ('surface = { balls = [{ at = [0, 0, 0], radi = [1, 1, 1] }] }\n', "radi"),
+        ("surface = { balls = [{ at = [0, 0, 0], radi = [1, 1, 1] }] }\n", "radi"),
     ],
 )
 def test_a_wrong_key_or_name_is_found(wrong, told, tmp_path):

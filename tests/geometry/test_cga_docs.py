@@ -2,13 +2,14 @@
 
 import doctest
 import re
-from pathlib import Path
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "cga.md"
+from tests.docs.blocks import PAGES, part_text
+
+PAGE = PAGES["printed-cga"]
 
 
 def test_every_example_of_the_page():
-    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.S)
+    blocks = re.findall(r"```python\n(.*?)```", part_text("printed-cga"), re.S)
     test = doctest.DocTestParser().get_doctest("".join(blocks), {}, PAGE.name, str(PAGE), 0)
     assert len(test.examples) > 40
     told: list[str] = []

@@ -96,7 +96,7 @@ def test_a_body_that_morphs_is_fitted_as_such_from_low_frequencies_to_high():
     arms = [body.tree.coordinate(name) for name in ("arm_add_r", "arm_flex_l")]
 
     def posed(degrees):
-        angles = body.usual_state().angles.copy()
+        angles = body.default_state().angles.copy()
         angles[arms] = np.radians([-50.0 - degrees, 60.0 + degrees])
         return BodyState(np.eye(4), angles)
 

@@ -19,7 +19,7 @@ from kinefit.papers.voodoo import Settings, voodoo
 from kinefit.solving.correspondences import joint_bands
 
 BODY = load_body("humanoid10")
-STATE = BODY.usual_state()
+STATE = BODY.default_state()
 FRAMES, _ = BODY.tree.forward(STATE.T_world_root, STATE.angles)
 BOXES = boxing.boxes_of(BODY)
 CAMERA = Camera("cam", (160, 120), np.array([[150.0, 0, 80], [0, 150, 60], [0, 0, 1]]), (), "radtan",

@@ -36,7 +36,7 @@ def person(*, at=(0.0, 0.0, 0.0), **degrees):
     """Standing, at its usual posture but for some angles [deg]."""
     T = np.eye(4)
     T[:3, 3] = np.array([0.0, 0.92, 0.0]) + at
-    state = BODY.usual_state(T)
+    state = BODY.default_state(T)
     angles = state.angles.copy()
     for name, value in degrees.items():
         angles[BODY.tree.coordinate(name)] = np.radians(value)

@@ -24,7 +24,7 @@ VALUES = {"tx": 0.03, "ty": -0.02, "tz": 0.01, "rx": 0.02, "ry": -0.04, "rz": 0.
 def posture(seed=0):
     random = np.random.default_rng(seed)
     T = se3.transform(se3.exp_so3(random.normal(scale=0.5, size=3)), random.normal(scale=0.5, size=3))
-    state = BODY.usual_state(T)
+    state = BODY.default_state(T)
     return state.retract(random.normal(scale=0.05, size=BODY.tree.n_dofs))
 
 

@@ -99,7 +99,7 @@ def test_a_covariance_on_the_null_space_is_that_of_endless_weight():
     random = np.random.default_rng(1)
     B = random.normal(size=(80, body.tree.n_dofs))
     P = inverse(B.T @ B)
-    A = closed_at(body, body.usual_state()).jacobian
+    A = closed_at(body, body.default_state()).jacobian
     exact = on_null_space(P, np.concatenate([A, A[:1]]))  # an equation said twice changes nothing
     np.testing.assert_allclose(exact, inverse(B.T @ B + 1e8 * A.T @ A), atol=1e-6 * P.max())
     assert np.abs(A @ exact).max() < 1e-9 and np.all(np.diag(exact) <= np.diag(P) + 1e-12)
@@ -139,7 +139,7 @@ def test_a_pedal_under_a_known_load_is_pushed_along_the_line_through_the_hip(leg
 def test_forces_of_closures_of_a_body_with_gear():
     """Half of a bar's weight hangs in the left hand where the lifter's arms are alike, and the pelvis carries all."""
     body = load_body("weight_lifter")
-    state, off = onto(body, body.usual_state(), hard_equations(body))
+    state, off = onto(body, body.default_state(), hard_equations(body))
     assert off <= CLOSED
     load = load_of(body, state, body.landmarks.select(("bar_middle",)), [[0.0, -200.0, 0.0]])
     found = closure_forces(body, state, load)
@@ -150,7 +150,7 @@ def test_forces_of_closures_of_a_body_with_gear():
     loose = closure_forces(body, state, load, active=of_left_arm)
     assert not loose.forces and "no equilibrium: nothing balances the load on lumbar_extension" in str(loose)
     with pytest.raises(BodyError, match="no closures"):
-        closure_forces(load_body("humanoid"), load_body("humanoid").usual_state(), np.zeros(47))
+        closure_forces(load_body("humanoid"), load_body("humanoid").default_state(), np.zeros(47))
     with pytest.raises(BodyError, match="wing"):
         closure_forces(body, state, load, active=["wing"])
 
@@ -159,7 +159,7 @@ def test_forces_of_closures_of_a_body_with_gear():
 def test_what_two_legs_can_press_together_has_no_force(name, closure):
     """A crank that is braked, or a board that is loaded: one leg alone bears it, of two nobody knows which."""
     body = load_body(name)
-    state, _ = onto(body, body.usual_state(), lambda s: (closed_at(body, s).value, closed_at(body, s).jacobian))
+    state, _ = onto(body, body.default_state(), lambda s: (closed_at(body, s).value, closed_at(body, s).jacobian))
     load = np.zeros(body.tree.n_dofs)
     if name == "cyclist":
         load[6 + body.tree.coordinate("crank_angle")] = 25.0

@@ -53,7 +53,7 @@ def measured(kind, truth, seed=0):
 @pytest.mark.parametrize("seed", range(8))
 def test_a_posture_is_found_from_the_usual_one(kind, seed):
     truth = posture(HUMANOID, seed, 0.35)
-    start = HUMANOID.usual_state() if kind == "points" else HUMANOID.usual_state(truth.T_world_root)
+    start = HUMANOID.default_state() if kind == "points" else HUMANOID.default_state(truth.T_world_root)
     fit = levenberg_marquardt(HUMANOID, start, measured(kind, truth))
     assert fit.converged and fit.iterations < 40
     np.testing.assert_allclose(HUMANOID.positions(fit.state, POINTS), HUMANOID.positions(truth, POINTS), atol=1e-5)
@@ -135,7 +135,7 @@ def test_limits_hold_exactly():
 
 def test_solving_again_wins_nothing_where_limits_hold():
     body, points, x = beyond_limits(10)
-    state = body.usual_state()
+    state = body.default_state()
     for target in x:
         make = lambda s: point_rows(body, s, points, target, sigma=0.005)  # noqa: B023
         fit = levenberg_marquardt(body, state, make)

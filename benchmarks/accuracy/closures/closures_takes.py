@@ -244,7 +244,7 @@ def _solved(body: Body, towards: ParameterRows, driven: dict[int, float], last: 
         return [*rows(state), DofRows(A, -c, np.full(len(c), 1e4), np.full(len(c), -1))]
 
     if last is None:
-        posture = np.array(body.usual_state().angles)
+        posture = np.array(body.default_state().angles)
         posture[towards.index - 6] = towards.residual
         fits = []
         for turn in np.arange(4) * 0.5 * np.pi:

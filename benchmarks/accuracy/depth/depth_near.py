@@ -176,7 +176,7 @@ def _states(body: Body, rng: np.random.Generator, count: int) -> list[BodyState]
         x = np.array([np.sin(at), 0.0, np.cos(at)])  # the root's x axis is ahead, the camera is at +z of the person
         y = np.cos(lean) * np.array([0.0, 1.0, 0.0]) + np.sin(lean) * x
         z = np.cross(x, y) / np.linalg.norm(np.cross(x, y))
-        angles = np.array(body.usual_state().angles)
+        angles = np.array(body.default_state().angles)
         for name, spread in (("lumbar_extension", 5), ("neck_extension", 12), ("neck_rotation", 15)):
             angles[body.tree.coordinate(name)] += np.radians(rng.normal(0.0, spread))
         for s in "rl":
@@ -197,7 +197,7 @@ def _states(body: Body, rng: np.random.Generator, count: int) -> list[BodyState]
         if _likely(body, BodyState(T, state.angles), kind, side):
             out.append(BodyState(T, state.angles))
     while len(out) < count:  # a body that finds no second pose holds still
-        out.append(out[-1] if out else BodyState(T, body.usual_state().angles))
+        out.append(out[-1] if out else BodyState(T, body.default_state().angles))
     return out
 
 

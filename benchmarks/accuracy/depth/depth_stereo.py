@@ -171,7 +171,7 @@ def _space() -> None:
     """A person 2.7 m away before a wall, 640x480, 1,000 samples of the surface."""
     body = load_body("humanoid")
     camera = Camera("depth", (640, 480), [[550.0, 0, 319.5], [0, 550.0, 239.5], [0, 0, 1]])
-    state = body.usual_state(se3.transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 2.7])))
+    state = body.default_state(se3.transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 2.7])))
     depth = np.full((480, 640), 4.2, np.float32)
     depth[60:420, 250:370] = 2.6
     points, normals, segment = sample(body, 1000)

@@ -28,7 +28,7 @@ def person() -> tuple[NDArray, NDArray, NDArray]:
     body = load_body("humanoid10")
     parts = tuple(next(c for c in body.surfaces if c.segment == s) for s in range(len(body.tree.segments)))
     body = replace(body, surfaces=parts)
-    state = body.usual_state()
+    state = body.default_state()
     frames, _ = body.tree.forward(state.T_world_root, state.angles)
     rest, _, segment = sample(body, 10 * COUNT)
     f = frames[segment]

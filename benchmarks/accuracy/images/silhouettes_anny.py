@@ -39,7 +39,7 @@ def run(picture: Path | None = DRAWN) -> None:
     print(f"  {ANNY_CREDIT}")
     for name, topology, goal in zip(names, ("collapsed", "full"), ("<= 0.1", "<= 0.5")):
         model = Morphing(load_anny(files, topology).body())
-        state = model.body.usual_state()
+        state = model.body.default_state()
         figure(name, least_ms(lambda: model.pose(state).vertices), "ms", goal)  # noqa: B023
     folder, model = recording("video_balancing_4cam"), load_anny(files)
     rig, masks, start = first_motion(folder)

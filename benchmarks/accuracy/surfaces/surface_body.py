@@ -46,7 +46,7 @@ def moving_arm(seed: int, frames: int) -> Motion:
     """A motion of the catalogue's arm at 30 Hz: all angles but the wrist's swing by 5 to 30 degrees."""
     body, rng, time = load_body("arm"), np.random.default_rng(seed), np.arange(frames) / 30.0
     names = body.tree.coordinates
-    angles = np.tile(body.usual_state().angles, (frames, 1))
+    angles = np.tile(body.default_state().angles, (frames, 1))
     about = {"arm_flex_r": 20, "arm_add_r": -10, "arm_rot_r": 5, "elbow_flex_r": 60, "pro_sup_r": 55, "wrist_flex_r": 0}
     for name, middle in about.items():
         swing = rng.uniform(5, 15) if name != "elbow_flex_r" else rng.uniform(15, 30)

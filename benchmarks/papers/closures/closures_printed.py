@@ -57,7 +57,7 @@ def boots() -> None:
     closed = known_gear(load_body("snowboarder"))
     equations = hard_equations(closed)
     assert equations is not None
-    start, _ = onto(closed, closed.usual_state(), equations)
+    start, _ = onto(closed, closed.default_state(), equations)
     bent = np.array([0.1 if "knee" in name or "hip_flexion" in name else 0.0 for name in closed.tree.coordinates])
     truth, _ = onto(closed, start.retract(np.append(np.zeros(6), bent)), equations)
     cameras = Rig(tuple(_camera(f"{turn:.1f}", turn, 0.0, 4.0) for turn in 0.4 + np.pi / 2 * np.arange(4)))

@@ -126,7 +126,7 @@ def first_pose(body: Body, rig: Rig, seen: list[SilhouetteFrame]) -> tuple[BodyS
         T[:3, 2] = np.cross(T[:3, 0], y)
         T[:3, 3] = wrist
         accuracy = {f"silhouette {c.name}": SIGMA for c in rig}
-        start = body.usual_state(T)
+        start = body.default_state(T)
         found.append(coarse_to_fine(body, rig, seen, start, sigma=accuracy, levels=levels, settings=SETTINGS))
     best = max(found, key=lambda f: f.overlap)
     return best.result.state, best.overlap

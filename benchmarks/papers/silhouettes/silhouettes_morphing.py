@@ -58,7 +58,7 @@ def sequence(body: Body, frames: int = FRAMES) -> list[BodyState]:
         "arm_flex_l": 60 + 55 * np.sin(t), "elbow_flex_l": 50 + 35 * np.sin(2.5 * t),
     }  # fmt: skip
     for k in range(frames):
-        angles = body.usual_state().angles.copy()
+        angles = body.default_state().angles.copy()
         for name, values in q.items():
             angles[body.tree.coordinate(name)] = np.radians(values[k])
         sway = [0.03 * np.sin(t[k]), 0.0, 0.02 * np.sin(2 * t[k]), 0.0, 0.08 * np.sin(t[k]), 0.0]

@@ -1,4 +1,4 @@
-"""The picture of `docs/recipes/voodoo.md`: three movements by depth, by features, by both.
+"""The picture of `docs/papers/p2.md`: three movements by depth, by features, by both.
 
     python -m benchmarks.papers.voodoo.depth_voodoo_picture
 

@@ -148,9 +148,11 @@ class Body:
         """Names (6 + D,) of all degrees of freedom."""
         return ROOT_DOFS + self.tree.coordinates
 
-    def usual_state(self, T_world_root: NDArray | None = None) -> BodyState:
+    def default_state(self, T_world_root: NDArray | None = None) -> BodyState:
         """State in the default posture, from which fits start; T_world_root (4, 4) [m], default the identity."""
         return BodyState(np.eye(4) if T_world_root is None else T_world_root, self.tree.usual)
+
+    usual_state = default_state  # the name in version 0.2
 
     def rest_state(self, T_world_root: NDArray | None = None) -> BodyState:
         """State with all angles zero, or at the nearest limit; T_world_root (4, 4) [m], default the identity."""

@@ -215,7 +215,7 @@ class Motion:
         return f"<b>{first}</b><br>" + "<br>".join(rest)
 
     def _lines(self) -> list[str]:
-        """Five lines that tell what it is."""
+        """Summary in five lines."""
         tree, worst = self.body.tree, int(np.argmin(self.quality)) if len(self) else 0
         stature = f", {self.body.stature:.2f} m tall" if self.body.stature else ""
         parts = [f"{name} ({r.median_text()})" for name, r in self.residuals.items()]

@@ -1,4 +1,4 @@
-"""`kinefit body`: the bodies that come along, copies of them, and whether a body's closed chains hold together."""
+"""`kinefit body`: list and copy the bodies of the catalogue, and check the closed chains of a body."""
 
 from __future__ import annotations
 

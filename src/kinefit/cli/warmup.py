@@ -89,7 +89,7 @@ def _surfaces() -> None:
         points = tracker.update(images)
     body = load_body("arm_metaballs")
     follower = Tracker(body, rig, rate=30.0, sensors=[SurfacePointSensor("surface")], up="y")
-    follower.start_at(body.usual_state())
+    follower.start_at(body.default_state())
     for k in range(3):
         frame = SurfacePointFrame("surface", k / 30.0, points.ids, points.x_world, points.covariance)
         follower.update([frame])

@@ -173,7 +173,7 @@ class Detections:
 
     @property
     def has_faces(self) -> bool:
-        """Whether somebody's face is seen in a frame."""
+        """Whether a frame shows a face."""
         return self.face_confidence is not None and bool(self.face_confidence.any())
 
     def mask(self, frame: int, person: int) -> NDArray | None:

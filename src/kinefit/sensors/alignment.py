@@ -82,7 +82,7 @@ class SensorAlignment:
 
     @property
     def usable(self) -> bool:
-        """Whether it is so near to where it is stated that a person's surface tells where it belongs."""
+        """Whether the stated pose is close enough for a person's surface to determine the true one."""
         return self.turn < MISFIT_SIGMAS * POSE_SIGMAS[1]
 
     @cached_property

@@ -91,7 +91,7 @@ def look_at(eye: NDArray, target: NDArray, up: NDArray) -> NDArray:
     return T
 
 
-def beside(camera: Camera, name: str, baseline: float) -> Camera:
+def shifted_camera(camera: Camera, name: str, baseline: float) -> Camera:
     """The same camera, `baseline` [m] to its right: the second of a stereo head."""
     T = np.eye(4)
     T[0, 3] = -baseline
@@ -157,7 +157,7 @@ def portrait(body: Body, azimuth: float = 40.0, size: tuple[int, int] = (900, 90
     """
     if not body.surfaces:
         raise BodyError(f"body '{body.name}' has no surfaces to render", remedy="Add a surface to its segments.")
-    state = closed_poses(body, most=1)[0] if body.closures else body.usual_state()
+    state = closed_poses(body, most=1)[0] if body.closures else body.default_state()
     motion = known_motion(body, 1.0, state.T_world_root[None], state.angles[None])
     frames, _ = body.tree.forward(state.T_world_root, state.angles)
     points_of_limbs = [

@@ -330,7 +330,7 @@ def on_body(motion: Motion, body: Body) -> Motion:
     if body.stature > 0 and motion.body.stature > 0:
         scale = body.stature / motion.body.stature
     targets = scale * motion.positions(motion.body.landmarks.select(names))
-    state, roots, angles = body.usual_state(), [], []
+    state, roots, angles = body.default_state(), [], []
     for frame, target in enumerate(targets):
         start = BodyState(_aligned(body, state, points, target), state.angles)
         change = _CHANGE_STD if frame else np.inf

@@ -19,7 +19,7 @@ from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import bare, matched
 from kinefit.errors import ObservationError, choices
 from kinefit.observations import Markers
-from kinefit.solving.rigid_clusters import local, middle, rigid_frames, shape_of
+from kinefit.solving.rigid_clusters import local, nan_median, rigid_frames, shape_of
 
 MIN_TURN_STD = np.deg2rad(8.0)
 """[rad] standard deviation of a rotation that determines a centre. Skin displaces a segment's pose by some 3 mm at the
@@ -108,7 +108,7 @@ def functional_axis(markers: Markers, parent: Sequence[str], child: Sequence[str
     for _ in range(_REFITS):
         U, _, Vt = np.linalg.svd(np.einsum("fji,fjk->ik", Rp[good], Rc[good]))
         u, v = U[:, 0], Vt[0]  # unit vectors that minimise Σ |R_p u − R_c v|²
-        in_child = middle(local(Rc[good], tc[good], x[good]), axis=(0, 1))  # of the child's markers
+        in_child = nan_median(local(Rc[good], tc[good], x[good]), axis=(0, 1))  # of the child's markers
         start = np.concatenate([_median_in_frame(Rp[good], tp[good], Rc[good] @ in_child + tc[good]), in_child])
         A = np.concatenate([Rp[good], -Rc[good]], axis=2).reshape(-1, 6)
         across = np.linalg.svd(np.concatenate([u, v])[None])[2][1:].T  # (6, 5): a shift along the axis is free
@@ -156,12 +156,12 @@ def _sphere(x: NDArray) -> tuple[NDArray, float, NDArray]:
     rng, frames, least = np.random.default_rng(0), np.flatnonzero(good), np.inf
     for _ in range(_SPHERE_STARTS):  # least median of squares: robust against half of the frames
         c, radii, _ = sphere_centre(x[rng.choice(frames, min(len(frames), 2 * _MIN_FRAMES), replace=False)])
-        off = middle(np.abs(np.linalg.norm(x - c, axis=2) - radii), axis=1)
+        off = nan_median(np.abs(np.linalg.norm(x - c, axis=2) - radii), axis=1)
         if (typical := float(np.nanmedian(off[frames]))) < least:
             least, good = typical, _inliers(off, good)
     for _ in range(_REFITS):
         c, radii, misfit = sphere_centre(x[good])
-        off = middle(np.abs(np.linalg.norm(x - c, axis=2) - radii), axis=1)
+        off = nan_median(np.abs(np.linalg.norm(x - c, axis=2) - radii), axis=1)
         good = _inliers(off, good)
     directions = (x[good] - c) / radii[:, None]
     J = (directions - np.nanmean(directions, axis=0)).reshape(-1, 3)

@@ -109,7 +109,7 @@ def mobility(body: Body, seed: int = 0, *, planar: bool = False) -> Mobility:
 
 def _in_plane(body: Body) -> list[int]:
     """Number of equations of each closure in the plane of the body's motion."""
-    state, tree = body.usual_state(), body.tree
+    state, tree = body.default_state(), body.tree
     v, w = np.split(tree.forward(state.T_world_root, state.angles)[1], 2, axis=1)
     turning = w[np.linalg.norm(w, axis=1) > 0.5]
     normal = turning[0] / np.linalg.norm(turning[0]) if len(turning) else np.zeros(3)
@@ -134,7 +134,7 @@ def closed_poses(body: Body, seed: int = 0, most: int = _POSES) -> list[BodyStat
     BodyError
         No such pose was found.
     """
-    random, out, least = np.random.default_rng(seed), list[BodyState](), (np.inf, body.usual_state())
+    random, out, least = np.random.default_rng(seed), list[BodyState](), (np.inf, body.default_state())
     for k in range(_MAX_STARTS):
         state, off = _closed(body, _start(body, random, 0.0 if k == 0 else 1.0))
         if off <= CLOSED:
@@ -175,7 +175,7 @@ def check_closed(body: Body) -> None:
     """
     if not body.closures:
         return
-    random, least = np.random.default_rng(0), (np.inf, body.usual_state())
+    random, least = np.random.default_rng(0), (np.inf, body.default_state())
     for k in range(_MAX_STARTS):
         state, _ = _closed(body, _start(body, random, 0.0 if k == 0 else 1.0))
         closed = closed_at(body, state)
@@ -198,7 +198,7 @@ def _start(body: Body, random: np.random.Generator, share: float) -> BodyState:
     tree = body.tree
     width = np.minimum(np.where(np.isfinite(tree.upper - tree.lower), 0.5 * (tree.upper - tree.lower), 1.0), 1.0)
     delta = np.concatenate([np.zeros(6), share * width * random.uniform(-1.0, 1.0, len(width))])
-    return body.usual_state().retract(delta, (tree.lower, tree.upper))
+    return body.default_state().retract(delta, (tree.lower, tree.upper))
 
 
 def _closed(body: Body, start: BodyState) -> tuple[BodyState, float]:

@@ -12,10 +12,9 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.se3 import nearest_rotation
 
 
-def middle(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
+def nan_median(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
     """Median along an axis, without NaN; NaN, with no warning, if all are NaN."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         median = np.nanmedian if np.isnan(values).any() else np.median  # the same, several times as fast
         return np.asarray(median(values, axis=axis))
 
@@ -61,7 +60,7 @@ def shape_of(y: NDArray) -> NDArray:
     shape = y[int(np.argmax(np.isfinite(y[..., 0]).sum(1)))]
     shape = np.where(np.isfinite(shape), shape, np.nanmean(shape, axis=0))
     for _ in range(3):
-        typical = middle(local(*rigid_frames(shape, y), y), axis=0)
+        typical = nan_median(local(*rigid_frames(shape, y), y), axis=0)
         shape = np.where(np.isfinite(typical), typical, shape)
     return shape
 

@@ -187,7 +187,7 @@ def _of_blob(
 
 
 def _moves(blob: DepthBlob, step: int, found: Mapping[int, Sequence[DepthBlob]]) -> bool:
-    """Whether a thing covers other pixels in another image; furniture does not, nor does one image tell."""
+    """Whether an object covers other pixels in another image, unlike furniture; False if there is one image."""
     others = [found[at] for at in found if at != step]
     overlaps = [max((_overlap(blob.mask, b.mask) for b in among), default=0.0) for among in others]
     return min(overlaps, default=1.0) < _MIN_STATIC_OVERLAP

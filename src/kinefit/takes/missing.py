@@ -1,4 +1,4 @@
-"""What a take lacks is found once, by whoever asks first, and kept beside it: detections, cameras, clocks, faces."""
+"""Compute what a take lacks (detections, cameras, clocks, faces) once, and store it next to the take."""
 
 from __future__ import annotations
 
@@ -231,7 +231,7 @@ def _made_from(take: Take) -> dict[str, str]:
 
 
 def _content(file: Path) -> str:
-    """What tells one version of a file from another: its bytes, or for one of thousands its size and time."""
+    """Digest of a file's version: its bytes; for JSON, of which folders hold thousands, its size and time."""
     if file.suffix != ".json":
         return hashlib.sha256(regular(file).read_bytes()).hexdigest()
     stat = file.stat()

@@ -19,11 +19,11 @@ from kinefit.fitting.tracking.checkpoints.checkpoint import Checkpoint, Tracking
 from kinefit.fitting.tracking.recording import Recording
 from kinefit.fitting.tracking.sizing import channels_of
 from kinefit.fitting.tracking.take_recording import (
-    from_afar,
     label_findings_of,
     on_floor,
     recording_of,
     rig_on_floor,
+    with_fitted_start,
 )
 from kinefit.fitting.tracking.video import Progress, track
 from kinefit.markers.take.takes import with_names
@@ -92,7 +92,7 @@ def track_take(
         if view is not None:
             recording = view.recording(recording, body, take.person, settings)
         if take.pose is not None:
-            recording = from_afar(recording, body, settings, low_pass=take.pose.low_pass)
+            recording = with_fitted_start(recording, body, settings, low_pass=take.pose.low_pass)
         labels = label_findings_of(take, seen, body, refuse=True)
         followed = recording.followed.keypoints if recording.followed else ()
         findings = (*labels, *input_findings(take, seen, followed, body))

@@ -1,10 +1,10 @@
 """Morphs in body files: read, mirrored, written and read again; bodies told as a change of others."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.docs.blocks import blocks
 
 from kinefit.bodies import BodyState, load_body, parse_body, save_body
 from kinefit.bodies.morphs.morph_files import format_morphs
@@ -192,12 +192,11 @@ def test_a_part_goes_with_its_morphs():
         body = without_part(body, name)
     kinds = [type(m) for m in body.morphs if m.steering.coordinate.endswith("_r")]
     assert kinds == [JointMotion, LocalMorph] and sum(isinstance(m, SegmentMorph) for m in body.morphs) == 1
-    Morphing(body).pose(body.usual_state())
+    Morphing(body).pose(body.default_state())
 
 
 def test_the_docs_example_is_a_body():
-    text = (Path(__file__).parents[3] / "docs" / "morphing.md").read_text("utf-8")
-    example, tendon = (block.partition("```")[0] for block in text.split("```toml\n")[1:3])
+    example, tendon = (block.text for block in blocks("morphing", "toml")[:2])
     assert [type(m) for m in parse_body(example).morphs] == [LocalMorph, JointMotion]
     (found,) = parse_body(f'[body]\nname = "t"\nbase = "arm"\n{tendon}').morphs
     assert found.deforms and found.moves

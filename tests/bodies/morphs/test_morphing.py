@@ -273,7 +273,7 @@ def test_a_fit_sees_the_morphed_body():
     """Gauss-Newton with the morph's derivative reaches the truth; the rigid body and a held morph fall behind."""
     morphing = shoulder()
     body, seen = morphing.body, np.arange(0, len(morphing.mesh.vertices), 7)
-    truth = body.usual_state().angles.copy()
+    truth = body.default_state().angles.copy()
     truth[[body.tree.coordinate(n) for n in ("arm_add_r", "arm_flex_r", "elbow_flex_r")]] = -0.8, 0.7, 0.6
     truth = BodyState(se3.exp([0.1, 0.2, 2.0, 0.1, -0.2, 0.1]), truth)
     target = morphing.pose(truth).vertices[seen]
@@ -294,7 +294,7 @@ def test_a_fit_sees_the_morphed_body():
 
 def test_rows_leave_out_what_was_not_seen_and_refuse_nonsense():
     morphing = shoulder()
-    pose = morphing.pose(morphing.body.usual_state())
+    pose = morphing.pose(morphing.body.default_state())
     n, r = np.tile([1.0, 0, 0], (4, 1)), np.array([0.01, np.nan, 0.02, 0.03])
     rows = morphed_rows(pose, [1, 2, 3, 4], n, r)
     fewer = morphed_rows(pose, [1, 3, 4], n[:3], r[[0, 2, 3]])

@@ -15,7 +15,7 @@ OMEGA = {"sqrt": lambda t: 1.0 - np.sqrt(t), "linear": lambda t: 1.0 - t, "squar
 
 
 def state(t, raised):
-    angles = BODY.usual_state().angles.copy()
+    angles = BODY.default_state().angles.copy()
     angles[BODY.tree.coordinate("pro_sup_l")] = t
     angles[BODY.tree.coordinate("arm_add_r")] = -np.radians(raised)
     return BodyState(np.eye(4), angles)

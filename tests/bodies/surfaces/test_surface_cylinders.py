@@ -184,7 +184,7 @@ def test_the_result_does_not_depend_on_the_blocks(count):
 
 def test_nearest_moves_with_the_body():
     body, random = load_body("humanoid10"), np.random.default_rng(2)
-    state = body.usual_state()
+    state = body.default_state()
     x = body.positions(state, body.landmarks) + random.normal(scale=0.03, size=(len(body.landmarks), 3))
     T = se3.exp(random.normal(size=6))
     here = nearest(body, state, x, max_distance=0.2, exact=True)
@@ -202,7 +202,7 @@ def test_nearest_moves_with_the_body():
 
 def test_nearest_of_wrong_points_is_told():
     body = load_body("arm")
-    state = body.usual_state()
+    state = body.default_state()
     for x, options in (
         (np.zeros((3, 2)), {}), ([[np.nan, 0, 0]], {}), (np.zeros((2, 3)), {"max_distance": 0.0}),
         (np.zeros((2, 3)), {"only": [0, 9]}), (np.zeros((2, 3)), {"only": [0.5, 1.0]}),

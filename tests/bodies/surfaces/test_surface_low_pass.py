@@ -29,7 +29,7 @@ def test_bumps_go_and_the_shape_stays():
 
 def test_a_body_that_morphs_still_does():
     model = Morphing(load_body("humanoid_morphing"))
-    (smooth, whole), state = model.levels(2), model.body.usual_state()
+    (smooth, whole), state = model.levels(2), model.body.default_state()
     angles = np.array(state.angles)
     angles[model.body.tree.coordinate("arm_add_r")] = np.radians(-110.0)
     raised = type(state)(state.T_world_root, angles)
@@ -55,4 +55,4 @@ def test_a_body_of_series_goes_through_their_orders(tmp_path):
     body = replace(body, surfaces=(body.surfaces[0].scaled(2.0).mirrored(),))
     for found, expected in zip(Morphing(body).levels(3), levels(series, 3), strict=True):
         nodes = expected.triangles((32, 20))[0] * (2.0, 2.0, -2.0)
-        np.testing.assert_allclose(found.pose(body.usual_state()).vertices, nodes, atol=1e-9)
+        np.testing.assert_allclose(found.pose(body.default_state()).vertices, nodes, atol=1e-9)

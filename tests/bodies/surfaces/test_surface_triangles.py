@@ -67,7 +67,7 @@ def test_segments_with_several_surfaces_and_without_any():
     surfaces = (replace(CYLINDER, segment=2), MeshSurface(1, *box((0.1, 0.1, 0.1))), replace(CYLINDER, segment=2))
     mesh = body_mesh(replace(body, surfaces=surfaces), around=5, along=1)
     assert np.bincount(mesh.face_segment).tolist() == [0, 12, 40]
-    state = body.usual_state()
+    state = body.default_state()
     frames, _ = body.tree.forward(state.T_world_root, state.angles)
     assert np.isfinite(mesh.posed(frames)).all()
     with pytest.raises(BodyError, match="no surfaces"):

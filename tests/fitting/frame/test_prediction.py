@@ -24,7 +24,7 @@ def a_filter(memory=1e9):
 def test_it_agrees_with_the_filter_of_one_angle():
     """Every angle on its own, measured with 3 degrees: pose, velocity and variance of the textbook's filter."""
     angle, noise, random = 7, np.radians(3), np.random.default_rng(0)
-    state = BODY.usual_state()
+    state = BODY.default_state()
     prediction = a_filter()
     prediction.start(state, np.full(N, 0.1))
     x, v = state.angles[angle - 6], 0.0
@@ -51,7 +51,7 @@ def test_belief_pulls_all_degrees_of_freedom_together():
     rng = np.random.default_rng(1)
     A = rng.normal(size=(N, N))
     information = A @ A.T
-    state, there = BODY.usual_state(), BODY.usual_state().retract(0.01 * rng.normal(size=N))
+    state, there = BODY.default_state(), BODY.default_state().retract(0.01 * rng.normal(size=N))
     row = prediction_row(state, there, information)
     assert isinstance(row, ParameterRows)
     equations = normal_equations(BODY, state, row)
@@ -62,7 +62,7 @@ def test_belief_pulls_all_degrees_of_freedom_together():
 
 def test_a_velocity_that_nothing_confirms_fades():
     prediction = a_filter(memory=0.1)
-    prediction.start(BODY.usual_state())
+    prediction.start(BODY.default_state())
     for _ in range(10):
         ahead, information = prediction.ahead()
         prediction.correct(ahead.retract(np.full(N, 0.01)), 0.1 * np.linalg.inv(information))
@@ -81,7 +81,7 @@ def test_a_velocity_that_nothing_confirms_fades():
 
 def test_halt_stays():
     prediction = a_filter()
-    prediction.start(BODY.usual_state())
+    prediction.start(BODY.default_state())
     ahead, information = prediction.ahead()
     prediction.correct(ahead.retract(np.full(N, 0.05)), 0.1 * np.linalg.inv(information))
     prediction.halt()
@@ -95,7 +95,7 @@ def test_what_is_out_of_sight_may_go_on_as_it_went():
     prediction, speed = Prediction(walker, DT, angle_acceleration=ACCELERATION, root_acceleration=1.0, memory=0.1), 1.5
     step = np.zeros(N)
     step[0] = speed * DT
-    prediction.start(BODY.usual_state())
+    prediction.start(BODY.default_state())
     for _ in range(20):
         ahead, information = prediction.ahead()
         prediction.correct(prediction.state.retract(step), np.linalg.inv(information + 1e6 * np.eye(N)))
@@ -126,7 +126,7 @@ def test_another_chart_goes_on_the_same_way():
 def carried(*steps, memory=1e9):
     """State, covariance and velocity after some steps that nothing is measured in."""
     prediction = a_filter(memory)
-    prediction.start(BODY.usual_state(), np.full(N, 0.1))
+    prediction.start(BODY.default_state(), np.full(N, 0.1))
     for _ in range(3):
         ahead, information = prediction.ahead()
         prediction.correct(ahead.retract(np.full(N, 0.01)), 0.1 * np.linalg.inv(information))
@@ -182,6 +182,6 @@ def test_a_crank_goes_on_where_a_knee_fades():
         prediction = Prediction(rider, DT, angle_acceleration=1.0, root_acceleration=1.0, memory=0.1)
         speed = np.zeros(body.tree.n_dofs)
         speed[chosen] = 0.01
-        prediction.go_on(body.usual_state(), np.full(body.tree.n_dofs, 0.1), speed)
+        prediction.go_on(body.default_state(), np.full(body.tree.n_dofs, 0.1), speed)
         prediction.ahead(0.1 / DT)
         np.testing.assert_allclose(prediction.velocity[chosen], 0.01 * np.array(lasts), rtol=1e-9)

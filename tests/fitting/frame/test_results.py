@@ -9,7 +9,7 @@ from kinefit.solving.equations import joint_moves
 
 BODY = load_body("humanoid")
 TREE = BODY.tree
-STATE = BODY.usual_state(np.eye(4))
+STATE = BODY.default_state(np.eye(4))
 SEEN = "pelvis", "thigh_r", "thigh_l", "clavicle_r", "clavicle_l", "upperarm_r", "upperarm_l"
 ELBOWS = "forearm_r", "forearm_l"
 

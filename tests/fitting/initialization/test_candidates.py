@@ -44,7 +44,7 @@ FEW = ("neck", "r_wrist", "l_ankle", "r_hip", "l_hip")
 
 
 def starts(*frames, count=3):
-    scene = Scene(BODY, BODY.usual_state(np.eye(4)), a_rig())
+    scene = Scene(BODY, BODY.default_state(np.eye(4)), a_rig())
     known = Sensors(a_rig(), RATE, {}, TrackSettings()).measurements(frames, scene, points=True)
     found = starts_from_points(BODY, known, scene, np.array([0.0, 1.0, 0.0]))
     return found or [[], *starts_from_views(scene, frames, UP, known, count)][-1]
@@ -149,7 +149,7 @@ def test_a_limb_that_is_where_it_is_does_not_leap(search):
 
 @pytest.mark.parametrize("side", ["l", "r"])
 def test_an_arm_stretched_at_the_camera_is_found(side):
-    hanging, camera = BODY.usual_state(TRUTH.T_world_root), a_rig()["depth"]
+    hanging, camera = BODY.default_state(TRUTH.T_world_root), a_rig()["depth"]
     truth = turned(hanging, **{f"arm_flex_{side}": 85, f"elbow_flex_{side}": 10})
     depth, wrist = render_body(BODY, truth, camera).depth, BODY.landmarks.names.index(f"{side}_wrist")
     person = np.isfinite(depth)

@@ -132,7 +132,7 @@ def test_scales_that_cannot_be_are_told():
 
 @pytest.mark.parametrize("heading", np.radians([0, 45, 90, 135, 180, 225, 270, 315]))
 def test_the_resting_body_is_laid_on_its_points_whatever_the_heading(heading):
-    truth = BODY.usual_state(se3.transform(se3.exp_so3([0.0, heading, 0.0]), [0.5, 0.2, -1.0]))
+    truth = BODY.default_state(se3.transform(se3.exp_so3([0.0, heading, 0.0]), [0.5, 0.2, -1.0]))
     T = aligned_root(BODY, POINTS, BODY.positions(truth, POINTS))
     turn = se3.log_so3(T[:3, :3] @ truth.T_world_root[:3, :3].T)
     assert np.linalg.norm(turn) < np.radians(15) and np.linalg.norm(T[:3, 3] - truth.T_world_root[:3, 3]) < 0.1

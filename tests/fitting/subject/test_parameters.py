@@ -45,7 +45,7 @@ def test_lengths_follow_the_size():
 
 
 def test_a_length_moves_the_segments_that_it_says():
-    lengths, state, random = SegmentScales(HUMANOID), HUMANOID.usual_state(np.eye(4)), np.random.default_rng(0)
+    lengths, state, random = SegmentScales(HUMANOID), HUMANOID.default_state(np.eye(4)), np.random.default_rng(0)
     segments = np.arange(len(HUMANOID.tree.segments))
     points = PointSet(HUMANOID.tree.segments, segments, random.normal(scale=0.1, size=(len(segments), 3)))
     for k, touched in enumerate(lengths.touches):

@@ -29,13 +29,13 @@ def frames_of(bias: ViewBias, cameras: int = 4, noise_px: float = 1.0) -> SeenFr
     uv = np.array(channels.uv)
     if bias.sets:
         layout = Layout(bias.known_to(channels), BODY)
-        uv += np.stack([layout.beside(Scene(BODY, state, rig)) for state in states])
+        uv += np.stack([layout.bias(Scene(BODY, state, rig)) for state in states])
     return SeenFrames(MOTION.body, channels, states, uv, channels.confidence)
 
 
 def seen_beside(bias: ViewBias, take: SeenFrames) -> np.ndarray:
     layout = Layout(bias.known_to(take.channels), BODY)
-    return np.stack([layout.beside(Scene(BODY, state, take.channels.rig)) for state in take.states])
+    return np.stack([layout.bias(Scene(BODY, state, take.channels.rig)) for state in take.states])
 
 
 def test_what_cameras_disagree_in_is_found():

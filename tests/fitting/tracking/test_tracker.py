@@ -423,7 +423,7 @@ def test_depth_needs_surfaces_and_markers_do_not():
 
 def test_a_state_of_another_body_is_told():
     with pytest.raises(BodyError, match="angles"):
-        a_tracker(start=None).start_at(load_body("arm").usual_state())
+        a_tracker(start=None).start_at(load_body("arm").default_state())
 
 
 NUMBERS = st.sampled_from((0.0, 1.0, -1.0, 2.7, 1e-30, 1e6, -1e6, 1e30, np.nan, np.inf, -np.inf))

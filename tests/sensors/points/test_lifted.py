@@ -88,7 +88,7 @@ def test_a_network_measures_the_persons_size(person):
 
 def test_hints_are_where_the_person_is():
     state = posture(BODY, 3)
-    scene = Scene(BODY, BODY.usual_state(np.eye(4)), RIG)
+    scene = Scene(BODY, BODY.default_state(np.eye(4)), RIG)
     hints = LiftedSensor(CAMERA.name, 0.2).prepare(lifted(state, 1.1), scene).hints(scene)
     off = np.linalg.norm(BODY.positions(state, hints.points) - hints.x_world, axis=1)
     assert len(off) == len(POINTS.names) and np.median(off) < 0.1

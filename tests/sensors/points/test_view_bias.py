@@ -9,7 +9,7 @@ from kinefit.fitting.tracking.video import track
 from kinefit.geometry.losses import geman_mcclure
 from kinefit.sensors.channels import make_channels
 from kinefit.sensors.points.keypoints import KeypointMeasurement, KeypointSensor, Layout, projected
-from kinefit.sensors.points.views import MIRRORED, TERMS, ViewBias, beside, directions, trunks
+from kinefit.sensors.points.views import MIRRORED, TERMS, ViewBias, directions, trunks, view_offset
 from kinefit.sensors.scene import Scene
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 
@@ -36,7 +36,7 @@ def test_points_are_seen_beside_as_the_formula_says():
     frames, _ = BODY.tree.forward(MOTION.Ts_world_root[3], MOTION.angles[3])
     trunk = random.integers(0, len(frames), 20)
     C = random.normal(0.0, 0.02, (20, TERMS, 3))
-    for n, pixels in enumerate(beside(C, trunk, x, frames, RIG, camera)):
+    for n, pixels in enumerate(view_offset(C, trunk, x, frames, RIG, camera)):
         eye, R = RIG.cameras[camera[n]], frames[trunk[n], :9].reshape(3, 3)
         d = R.T @ (eye.centre_world - x[n]) / np.linalg.norm(eye.centre_world - x[n])
         expected = eye.project(x[n] + R @ C[n].T @ directions(d)) - eye.project(x[n])
@@ -71,7 +71,7 @@ def test_a_known_bias_is_taken_out_of_the_fit_and_not_of_what_was_measured():
     given = channels.uv[5], channels.confidence[5], 0.0
     plain = KeypointMeasurement(sensor, Layout(channels, BODY), *given).match(scene, 0.03)
     known = KeypointMeasurement(sensor, layout, *given).match(scene, 0.03)
-    shift = layout.beside(scene)
+    shift = layout.bias(scene)
     assert np.abs(shift).max() > 3.0
     np.testing.assert_allclose(known.uv, plain.uv - shift, atol=1e-9)
     for a, b in zip(known.leftovers(scene), plain.leftovers(scene)):

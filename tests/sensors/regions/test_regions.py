@@ -166,7 +166,7 @@ def test_of_a_skin_that_morphs_rows_are_those_of_all_degrees_of_freedom():
     camera = Camera("cam", (320, 240), [[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]])
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = np.diag([1.0, -1.0, -1.0]), (0.0, 0.0, 3.0)
-    scene = Scene(body, body.usual_state(T), Rig((camera,)))
+    scene = Scene(body, body.default_state(T), Rig((camera,)))
     sensor = RegionSensor(camera, 3.0, TrackSettings())
     picture, finder = np.full((240, 320, 3), (60, 90, 140), np.uint8), scene.surface.rims(camera)
     finder.find(scene.pose.vertices, camera)

@@ -102,7 +102,7 @@ def test_frames_that_are_none():
     assert SurfacePointFrame("skin", 0.0, np.arange(3), x, c).ids.tolist() == [0, 2]
     with pytest.raises(ObservationError):
         SurfacePointSensor("skin", slide=0.0)
-    scene = Scene(BODY, BODY.usual_state(), Rig(()))
+    scene = Scene(BODY, BODY.default_state(), Rig(()))
     with pytest.raises(ObservationError, match="SurfacePointFrame"):
         SurfacePointSensor("skin").prepare(object(), scene)
     empty = SurfacePointFrame("skin", 0.0, np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
@@ -138,7 +138,7 @@ def test_how_a_limb_was_turned_at_first_lasts():
     points, _, segment = sample(arm, 200)
     sensor, tree = SurfacePointSensor("skin"), arm.tree
     tracker = Tracker(arm, Rig(()), rate=30.0, sensors=[sensor], up="y")
-    angles = np.array(arm.usual_state().angles)
+    angles = np.array(arm.default_state().angles)
     angles[tree.coordinate("elbow_flex_r")] = 1.2
     tracker.start_at(BodyState(np.eye(4), angles))
     forearm, turned = tree.segment("forearm_r"), tree.coordinate("pro_sup_r")

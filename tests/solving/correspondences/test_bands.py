@@ -60,7 +60,7 @@ def test_bands_of_closed_joints_are_slack(name):
 def test_bands_pull_parts_together_again():
     body = load_body("humanoid10")
     parts, bands = free_parts(body), joint_bands(body)
-    usual = body.usual_state()
+    usual = body.default_state()
     frames, _ = body.tree.forward(usual.T_world_root, usual.angles)
     apart = parts_state(parts, frames).retract(0.1 * RANDOM.normal(size=parts.tree.n_dofs))
     assert np.abs(band_rows(parts, apart, bands).residual).max() > 0.1
@@ -72,7 +72,7 @@ def test_a_joint_solve_of_skin_and_bands_finds_the_pose():
     """All parts at once, over the same rows as a tree: 3,000 points of the skin, not told their limb."""
     body = load_body("humanoid10")
     parts, bands = free_parts(body), joint_bands(body, elliptic=())
-    start = body.usual_state()
+    start = body.default_state()
     angles = np.array(start.angles)
     angles[[body.tree.coordinate("arm_flex_r"), body.tree.coordinate("knee_angle_l")]] += [0.3, 0.2]
     truth, _ = body.tree.forward(start.T_world_root, angles)

@@ -37,7 +37,7 @@ def turned(body, state, segment):
 @pytest.mark.parametrize("seed", range(2))
 def test_values_in_numpy(name, seed):
     body, random = load_body(name), np.random.default_rng(seed)
-    state = body.usual_state().retract(random.normal(scale=0.7, size=body.tree.n_dofs))
+    state = body.default_state().retract(random.normal(scale=0.7, size=body.tree.n_dofs))
     closed, owner = closed_at(body, state), owners(body)
     marks = body.landmarks
     for k, c in enumerate(body.closures):
@@ -113,7 +113,7 @@ def test_the_papers_equations_hold_a_closed_pair_in_place():
 @pytest.mark.parametrize("name", ["snowboarder", "cyclist"])
 def test_derivatives_of_the_papers_equations(name):
     body, random = known_gear(load_body(name)), np.random.default_rng(5)
-    state = body.usual_state().retract(random.normal(scale=0.3, size=body.tree.n_dofs))
+    state = body.default_state().retract(random.normal(scale=0.3, size=body.tree.n_dofs))
     points, x_world = closure_targets(body, state)
     rows = point_rows(body, state, points, x_world)
     expected = central_differences(lambda s: point_rows(body, s, points, x_world).residual, body, state)
@@ -122,7 +122,7 @@ def test_derivatives_of_the_papers_equations(name):
 
 def test_four_pairs_of_points_are_a_rigid_closure():
     body = known_gear(load_body("snowboarder"))
-    closed, off = onto(body, body.usual_state(), hard_equations(body))
+    closed, off = onto(body, body.default_state(), hard_equations(body))
     assert off < 1e-9
     np.testing.assert_allclose(paper_rows(body, closed).residual, 0.0, atol=1e-9)
     J = design(paper_rows(body, closed), body, closed)
@@ -133,7 +133,7 @@ def test_four_pairs_of_points_are_a_rigid_closure():
 def test_what_the_paper_has_no_equation_for_is_named():
     line = parse_body(LEG.replace('mode = "hard"', 'kind = "line"\naxis = "x"'))
     with pytest.raises(BodyError, match="closure 'foot' is a line"):
-        closure_targets(line, line.usual_state())
+        closure_targets(line, line.default_state())
     rider = load_body("cyclist")
     with pytest.raises(BodyError, match="'cyclist' has gear to estimate"):
-        closure_targets(rider, rider.usual_state())
+        closure_targets(rider, rider.default_state())

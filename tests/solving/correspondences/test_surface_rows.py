@@ -10,7 +10,7 @@ from kinefit.solving.correspondences import anchored_rows, surface_rows
 from kinefit.solving.correspondences.anchored import anchored
 
 BODY = load_body("humanoid10")
-STATE = BODY.usual_state()
+STATE = BODY.default_state()
 
 
 def cloud(count=400, seed=0):

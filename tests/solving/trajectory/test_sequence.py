@@ -57,7 +57,7 @@ def test_the_posture_prior_is_that_of_every_other_fit():
     assert BODY.tree.coupled
     states, x, _ = sway(frames=4)
     x[:, np.isin(POINTS.segments, [BODY.tree.segment(n) for n in ("abdomen", "thorax", "thigh_r", "shank_l")])] = np.nan
-    start = BODY.usual_state(states[0].T_world_root)
+    start = BODY.default_state(states[0].T_world_root)
     found = fit_sequence(BODY, start, POINTS, x, posture=1.0, tolerance=1e-12)
     for f, state in enumerate(states_of(found)):
         seen = np.isfinite(x[f, :, 0])
@@ -73,7 +73,7 @@ def test_the_posture_prior_is_that_of_every_other_fit():
 def test_solving_again_wins_nothing(loss):
     """Limits make steps bad, and hundreds of good steps lower the damping between them: it must be able to rise."""
     body, points, x = beyond_limits(1200)
-    found = fit_sequence(body, body.usual_state(), points, x, **SETTINGS[loss])
+    found = fit_sequence(body, body.default_state(), points, x, **SETTINGS[loss])
     at_limit = (found.angles <= body.tree.lower) | (found.angles >= body.tree.upper)
     assert at_limit.any(axis=1).mean() > 0.9
     gain = second_call(body, points, x, found.Ts_world_root, found.angles, **SETTINGS[loss])

@@ -63,13 +63,13 @@ def test_packets_say_what_the_protocol_says(scene, collected):
 
 def test_what_cannot_be_done_is_refused_and_the_session_goes_on(scene, collected):
     session = LiveSession(scene.tracker(), [scene.replay()], [collected])
-    wishes = [*REFUSED, ({"sensor": "cam01", "sigma": float("nan")}, "sigma of 'cam01' is nan")]
-    answers = [[] for _ in wishes]
-    for (wish, _), told in zip(wishes, answers):
-        session.ask(wish, told.append)
+    requests = [*REFUSED, ({"sensor": "cam01", "sigma": float("nan")}, "sigma of 'cam01' is nan")]
+    answers = [[] for _ in requests]
+    for (request, _), told in zip(requests, answers):
+        session.ask(request, told.append)
     session.run()
-    for (wish, why), told in zip(wishes, answers):
-        assert [a["type"] for a in told] == ["refused"] and why in told[0]["why"], wish
+    for (request, why), told in zip(requests, answers):
+        assert [a["type"] for a in told] == ["refused"] and why in told[0]["why"], request
     assert session.found == session.processed == len(scene.recording)
 
 
@@ -168,23 +168,23 @@ def test_a_source_that_fails_ends_the_session_with_its_error(scene, collected):
 class Asking:
     """A receiver that asks for something after some steps."""
 
-    def __init__(self, wishes):
-        self.wishes, self.count, self.answers = wishes, 0, []
+    def __init__(self, requests):
+        self.requests, self.count, self.answers = requests, 0, []
 
     def hello(self, body, packet):
         pass
 
     def pose(self, posed, packet):
-        if self.count in self.wishes:
-            self.session.ask(self.wishes[self.count], self.answers.append)
+        if self.count in self.requests:
+            self.session.ask(self.requests[self.count], self.answers.append)
         self.count += 1
 
     def close(self):
         pass
 
 
-def asked(scene, keypoints, wishes, *receivers):
-    asking = Asking(wishes)
+def asked(scene, keypoints, requests, *receivers):
+    asking = Asking(requests)
     replay = Replay(scene.recording, keypoints, speed=0.0)
     asking.session = LiveSession(scene.tracker(), [replay], [*receivers, asking])
     asking.session.run()

@@ -23,7 +23,7 @@ def _frames(count, data, opcode=Opcode.TEXT, fin=True):
 
 
 FLOODS = {
-    "wishes": _frames(500, b'{"sensor": "cam01", "sigma": 12}'),
+    "requests": _frames(500, b'{"sensor": "cam01", "sigma": 12}'),
     "nonsense": _frames(500, b"[" * 3000),
     "empty messages": _frames(5000, b""),
     "pings": _frames(5000, b"", Opcode.PING),

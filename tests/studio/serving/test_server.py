@@ -139,7 +139,7 @@ def test_an_allowance_grows_again_and_no_further_than_it_was():
     assert [allowance.take(10.0) for _ in range(4)] == [True, True, True, False]
     assert [allowance.take(10.4), allowance.take(10.5), allowance.take(10.6)] == [False, True, False]
     assert [allowance.take(99.0) for _ in range(4)] == [True, True, True, False]
-    assert MAX_FRAMES_AT_ONCE > 16  # as many wishes as a page has sensors
+    assert MAX_FRAMES_AT_ONCE > 16  # as many requests as a page has sensors
 
 
 def test_probes_print_nothing(server, capfd, caplog):

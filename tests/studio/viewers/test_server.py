@@ -374,7 +374,7 @@ def test_frames_are_thinned_evenly(count, most):
 def test_a_live_view_follows_states(rig):
     body = load_body("humanoid")
     with View(body, rig, up="y", port=0) as view:
-        state = body.usual_state(se3.transform(np.eye(3), np.array([0.3, 0.9, 0.1])))
+        state = body.default_state(se3.transform(np.eye(3), np.array([0.3, 0.9, 0.1])))
         image = np.full((480, 320, 3), 90, np.uint8)
         view.show(state, time=1.25, images={"cam 0": image})
         assert np.allclose(node(view.server, "body/pelvis").position, (0.3, 0.9, 0.1))

@@ -111,7 +111,7 @@ def _check_keys(record: MorphRecord) -> None:
     given = {name for name in record.__struct_fields__ if getattr(record, name) is not None} - _COMMON
     if missing := needed - given:
         problem = f"a {record.kind} morph without {', '.join(sorted(missing))}"
-        raise BodyError(problem, remedy="See docs/morphing.md for its keys.")
+        raise BodyError(problem, remedy="See docs/bodies.md for its keys.")
     if unexpected := given - needed - allowed:
         problem = f"a {record.kind} morph has no {', '.join(sorted(unexpected))}"
         raise BodyError(problem, remedy=f"It has {', '.join(sorted(needed | allowed))}.")

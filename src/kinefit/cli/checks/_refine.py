@@ -39,7 +39,7 @@ class Refined:
 
     @property
     def moved(self) -> tuple[SensorAlignment, ...]:
-        """Sensors of which it is sure where they belong: they alone are moved."""
+        """Sensors whose corrected pose is certain: these alone are moved."""
         return tuple(fit for fit in self.sensors if not fit.doubts)
 
     def summary_lines(self) -> list[str]:

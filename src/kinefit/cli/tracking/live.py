@@ -1,4 +1,4 @@
-"""`kinefit live`: poses while they happen, to whoever listens."""
+"""`kinefit live`: track a person in real time and send each pose to its receivers."""
 
 from __future__ import annotations
 

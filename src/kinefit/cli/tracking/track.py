@@ -197,7 +197,7 @@ def run(
 def _track_one(
     take: Take, out: Path, choices: Choices, view: InView | None, results: list[dict[str, Any]]
 ) -> tuple[int, TrackedPerson]:  # fmt: skip
-    """Track one person of a take, write what comes of it and tell it; returns the exit code and what was tracked."""
+    """Track one person of a take, write and print the results; returns the exit code and the tracked person."""
     from kinefit.cli._summary import as_record, print_files, print_summary
     from kinefit.errors import TrackingError
     from kinefit.findings import of_provenance

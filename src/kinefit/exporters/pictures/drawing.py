@@ -227,7 +227,7 @@ def hide_circles(image: NDArray[np.uint8], circles: NDArray) -> NDArray[np.uint8
 
 
 def hide_all(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A copy of a picture in which nobody can be recognised."""
+    """A copy of an image with all people unrecognisable."""
     return _coarse(image, max(image.shape[:2]) / _ALL_BLOCKS)
 
 

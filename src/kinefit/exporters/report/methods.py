@@ -1,4 +1,4 @@
-"""What was done, to paste into a paper and to do it again; the body's lengths."""
+"""Methods paragraph and settings of a motion, to cite and to repeat it, and the table of body lengths."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BUILT_IN_DETECTOR = "MediaPipe's pose networks as kinefit runs them (Bazarevsky
 
 
 def methods(motion: Motion, date: str, doubtful: int) -> list[p.Html]:
-    """A paragraph for a paper and the same as JSON; only what the motion and its provenance tell."""
+    """A paragraph for a paper and the same as JSON; only what the motion and its provenance hold."""
     text = " ".join(methods_sentences(motion, doubtful))
     facts = {
         "Body": f"{motion.body.name}, {len(motion.body.tree.coordinates)} angles",
@@ -159,7 +159,7 @@ def _settings(provenance: Mapping[str, Any]) -> list[str]:
 
 
 def _estimated(smoothing: Mapping[str, Any]) -> str:
-    """What smoothing found out from the take itself."""
+    """Values that smoothing estimated from the take."""
     parts = ["the size of the accelerations"] if isinstance(smoothing.get("acceleration"), Mapping) else []
     sigma = smoothing.get("pixel_sigma")
     values = [v for found in sigma.values() for v in found.values()] if isinstance(sigma, Mapping) else []

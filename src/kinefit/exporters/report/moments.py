@@ -235,7 +235,7 @@ def never_observed(motion: Motion) -> tuple[str, ...]:
 
 
 def shared_by_prior(motion: Motion) -> dict[str, float]:
-    """Coupled coordinates whose share of a bend the posture prior tells, with their median standard deviation [deg].
+    """Coupled coordinates whose share of a bend the posture prior decides: median standard deviation [deg].
 
     Those of a coupling are reported if none of them is known to 5 degrees, beyond which errors may mislead a clinician
     (McGinley et al. 2009, Gait & Posture 29:360).
@@ -324,7 +324,7 @@ def _merged(body: Body, found: Iterable[_Doubt]) -> list[Moment]:
 
 
 def _sentences(body: Body, group: Sequence[_Doubt]) -> Iterable[str]:
-    """What a moment's findings say; what is the same of several segments is said once, of all."""
+    """Sentences on the findings of a moment; one sentence for all segments with the same finding."""
     for kind in dict.fromkeys(g.kind for g in group):
         same = [g for g in group if g.kind == kind]
         names = spoken_segments(body, [g.segment for g in same])
@@ -339,7 +339,7 @@ def _sentences(body: Body, group: Sequence[_Doubt]) -> Iterable[str]:
 
 
 def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
-    """What the measurements of a moment tell about why it is doubtful."""
+    """Causes of a doubtful moment, as far as its measurements show them."""
     pixels = {name: r for name, r in motion.residuals.items() if r.unit == "px"}
     frames = slice(moment.start, moment.stop)
     out, share_seen, left_out, seen_points = [], {}, {}, 0

@@ -1,4 +1,4 @@
-"""report.html: one file that tells what came out, how far it can be trusted, and how it was made.
+"""report.html: results, their uncertainty and the methods, in one file.
 
     write_report(motion, "report.html")
 
@@ -155,7 +155,7 @@ def _subtitle(motion: Motion, date: str) -> str:
 def _summary(
     motion: Motion, moments: Sequence[Moment], throughout: str, findings: Sequence[tuple[str, str, str]], date: str
 ) -> p.Section:
-    """What was found, how sure it is and what to do, in five lines and one table of ranges."""
+    """Results, their confidence and what to do, in five lines and one table of ranges."""
     found, session = all_ranges(motion), motion.provenance.get("session")
     sure = [one for one in found if one.is_sure]
     severity, trust = _trust(motion, moments, throughout)
@@ -248,7 +248,7 @@ def _what_to_do(motion: Motion, moments: Sequence[Moment]) -> str:
 
 
 def _limits(motion: Motion, throughout: str) -> list[p.Html]:
-    """What the measurements do not tell, and what does not fit."""
+    """What the measurements do not determine, and what disagrees."""
     parts = []
     shifted = [f for f in sensor_fits(motion) if f.is_shifted]
     if shifted:

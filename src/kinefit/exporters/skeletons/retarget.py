@@ -441,7 +441,7 @@ def _glb(motion: Motion, found: Retargeted) -> bytes:
 
 
 def _as_parts(node: dict[str, Any], M: NDArray) -> None:
-    """A node that is to move says its pose in parts, not as a matrix."""
+    """Replace the matrix of a node that will move by translation, rotation and scale."""
     if node.pop("matrix", None) is None:
         return
     scale = np.linalg.norm(M[:3, :3], axis=0) * np.sign(np.linalg.det(M[:3, :3]))

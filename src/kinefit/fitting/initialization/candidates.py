@@ -179,7 +179,7 @@ def starts_from_rays(
     if known.sum() < _MIN_POINTS:
         return []
     body, (origin, direction) = scene.body, rays[known].swapaxes(0, 1)
-    rest = body.positions(body.usual_state(np.eye(4)), points)[known]
+    rest = body.positions(body.default_state(np.eye(4)), points)[known]
     axis = direction.mean(axis=0)
     axis /= np.linalg.norm(axis)
     angle = np.sqrt(np.mean(np.sum(np.square(direction - axis), axis=1)))
@@ -196,7 +196,7 @@ def starts_from_rays(
         across = (x - x.mean(axis=0)) @ (np.eye(3) - np.outer(axis, axis))
         distance = np.sqrt(np.mean(np.sum(np.square(across), axis=1))) / max(angle, 1e-6)
         T[:3, 3] = origin.mean(axis=0) + distance * axis - x.mean(axis=0)
-        start = body.usual_state(T)
+        start = body.default_state(T)
         fits.append(levenberg_marquardt(body, start, rows, max_iterations=_MAX_ITERATIONS, tolerance=_TOLERANCE))
     return [fit.state for fit in sorted(fits, key=lambda fit: fit.equations.cost)]
 

@@ -87,7 +87,7 @@ class PostureSearch:
     def trunks(self, count: int) -> list[BodyState]:
         """The best placements of trunk and head, with limbs at the prior mean: behind thick parts, at all headings."""
         roots = self._places()
-        angles = np.repeat(self.body.usual_state().angles[None], len(roots), axis=0)
+        angles = np.repeat(self.body.default_state().angles[None], len(roots), axis=0)
         core = self.score.core
         values = self.score(roots, angles, core) - self.stance(roots)
         candidates = []

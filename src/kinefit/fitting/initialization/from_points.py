@@ -149,7 +149,7 @@ def pose_from_points(
         return float(fit.costs[0]), BodyState(fit.Ts_world_root[0], fit.angles[0])
 
     starts = (
-        [near] if near else [body.usual_state(aligned_root(body, points, x_world) @ _turn(a)) for a in (0.0, np.pi)]
+        [near] if near else [body.default_state(aligned_root(body, points, x_world) @ _turn(a)) for a in (0.0, np.pi)]
     )
     rough = [start if near else fitted(start, SQUARED, 60)[1] for start in starts]
     fits = [fitted(start, geman_mcclure() if robust else SQUARED, 40) for start in rough]

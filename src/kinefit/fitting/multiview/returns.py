@@ -1,8 +1,8 @@
-"""Who comes back: spans of people before and after an absence, paired by size, clothes and way at the best odds.
+"""Re-identify people after an absence: pair their presence spans by size, clothes and path, at the highest odds.
 
-For every two spans of which one begins after the other ended there are odds that they are of one person: those of
-their looks (`same_log_ratio`) and of the way between. All are paired at once. What stays open, as another pairing
-would do nearly as well, is left apart and said.
+Two spans, one of which begins after the other ended, have odds of showing one person: those of their appearance
+(`same_log_ratio`) times those of the path between. All spans are paired jointly. A pair stays open, and is reported,
+where another pairing is nearly as likely.
 """
 
 from __future__ import annotations

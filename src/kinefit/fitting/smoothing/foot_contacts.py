@@ -154,7 +154,7 @@ def _above_sole(body: Body, points: PointSet) -> NDArray:
 def fit_floor(
     body: Body, roots: NDArray, angles: NDArray, x_rest: NDArray, above: NDArray, up: str, eye: NDArray | None = None
 ) -> FloorPlane:
-    """The plane on which soles rest; where they tell little of its tilt, it is level, or as the body stands.
+    """The plane on which soles rest; where they determine little of its tilt, it is level, or as the body stands.
 
     Parameters
     ----------

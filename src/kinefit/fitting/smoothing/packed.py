@@ -22,7 +22,7 @@ from kinefit.sensors.channels import Channels, joined
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.points.keypoints import KeypointMatched, pixels_of
 from kinefit.sensors.points.markers import MarkerMeasurement, MarkerSensor, markers_of, of_points
-from kinefit.sensors.points.views import beside, find_swaps, limb_groups, trunks
+from kinefit.sensors.points.views import find_swaps, limb_groups, trunks, view_offset
 from kinefit.sensors.scene import Scene
 from kinefit.solving.trajectory.seen_points import SeenPoints
 from kinefit.solving.trajectory.smoothing import unpacked
@@ -232,7 +232,7 @@ class PackedPixels(PackedPoints):
         weight = self.confidence[f] / np.square(self.channels.sigma)
         uv = np.where(weight[:, None] > 0, self.values[f], np.nan)
         return tuple(
-            replace(m, uv=uv, weight=weight, swapped=self.swapped[f], beside=m.measurement.layout.beside(scene))
+            replace(m, uv=uv, weight=weight, swapped=self.swapped[f], view_offset=m.measurement.layout.bias(scene))
             for m in pixels_of(tracked)
         )
 
@@ -393,7 +393,7 @@ def _without_bias(body: Body, channels: Channels, uv: NDArray, roots: NDArray, a
         for f in range(*some.indices(len(out))):
             x = body.positions(BodyState(roots[f], angles[f]), points)[channels.column]
             frames, _ = body.tree.forward(roots[f], angles[f])
-            out[f] = uv[f] - beside(channels.view_bias, trunk, x, frames, channels.rig, channels.camera)
+            out[f] = uv[f] - view_offset(channels.view_bias, trunk, x, frames, channels.rig, channels.camera)
         release(uv, out)
     return out
 

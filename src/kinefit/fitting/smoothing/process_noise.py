@@ -31,7 +31,7 @@ _MIN_SIGMA_RATIO = 0.01  # estimated to stated sigma of a point: of exact ones, 
 _PRIOR_MEASUREMENTS = 30.0  # independent measurements of a point that the estimate of its source counts as
 _PRIOR_CHANGES = 10.0  # changes of a degree of freedom that its prior acceleration counts as
 _MAX_RELATIVE_CHANGE = 0.05  # of all estimates between rounds, below which they have converged
-_LIVELINESS_STD_S = 0.15  # [s] of the window over which a limb's liveliness is averaged: half a quick reach or step
+_ACTIVITY_STD_S = 0.15  # [s] of the window over which a limb's activity is averaged: half a quick reach or step
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class SmoothTake:
 
     `pixels`, `markers`: keypoints and labelled markers; `others`: frames of all other sensors, `linear` their costs at
     the states; `acceleration` (n,) [m/s², rad/s²]: random acceleration of every degree of freedom, one standard
-    deviation; `observed` (T, D) bool: coordinates that a frame nearby observes on its own; `live` (T, n): liveliness,
+    deviation; `observed` (T, D) bool: coordinates that a frame nearby observes on its own; `live` (T, n): activity,
     a factor on the process noise;
     `speed_std` (n,) [m/s, rad/s]: 90th percentile over frames; `one_view`: one camera is the only sensor, so no other
     view contradicts the errors of its keypoints.
@@ -135,7 +135,7 @@ class SmoothTake:
 
 
 def estimate(takes: list[SmoothTake], rounds: int) -> tuple[list[SmoothTake], int]:
-    """Estimate accelerations, liveliness and pixel noise by iteration to a fixed point (empirical Bayes, MacKay 1992).
+    """Estimate accelerations, activity and pixel noise by iteration to a fixed point (empirical Bayes, MacKay 1992).
 
     With γ = Σ (1 − var(r)/a²), the number of changes r that the pixels observe, a² = Σ r² / γ. Pixels likewise.
 
@@ -146,7 +146,7 @@ def estimate(takes: list[SmoothTake], rounds: int) -> tuple[list[SmoothTake], in
 
     Returns
     -------
-    the parts with their noise, last states and liveliness, and the number of rounds
+    the parts with their noise, last states and activity, and the number of rounds
     """
     first = takes[0]
     body, channels, start = first.body, first.pixels.channels, first.acceleration
@@ -162,7 +162,7 @@ def estimate(takes: list[SmoothTake], rounds: int) -> tuple[list[SmoothTake], in
             take = takes[i]
             of_r, of_gamma = _changes(take, fit, post)
             squares, informed = squares + (of_r / np.square(take.live)).sum(axis=0), informed + of_gamma.sum(axis=0)
-            live = _liveliness(body, take.dt, of_r, of_gamma)
+            live = _activity(body, take.dt, of_r, of_gamma)
             level += (of_gamma * np.log(live)).sum(axis=0)
             takes[i] = replace(take, roots=fit.roots, angles=fit.angles, live=live)
             errors.append(_pixels(takes[i], post))
@@ -196,15 +196,15 @@ def _roughly(take: SmoothTake) -> tuple[Smoothed, Posterior]:
     return take.fit(tolerance=1e-3)
 
 
-def estimate_liveliness(take: SmoothTake, rounds: int = 3) -> SmoothTake:
-    """The take with its liveliness estimated, for known noise; its states are those of the last round.
+def estimate_activity(take: SmoothTake, rounds: int = 3) -> SmoothTake:
+    """The take with its activity estimated, for known noise; its states are those of the last round.
 
-    `rounds` is the most; they end when no liveliness changes by more than a twentieth.
+    `rounds` is the most; they end when no activity changes by more than a twentieth.
     """
     for _ in range(rounds):
         take = take.renewed()
         fit, post = _roughly(take)
-        live = _liveliness(take.body, take.dt, *_changes(take, fit, post))
+        live = _activity(take.body, take.dt, *_changes(take, fit, post))
         change = float(np.abs(np.log(live / take.live)).max())
         take = replace(take, roots=fit.roots, angles=fit.angles, live=live)
         if change < _MAX_RELATIVE_CHANGE:
@@ -260,10 +260,10 @@ def _changes(take: SmoothTake, fit: Smoothed, post: Posterior) -> tuple[NDArray,
     return squares, informed
 
 
-def _liveliness(body: Body, dt: float, squares: NDArray, informed: NDArray) -> NDArray:
-    """(T, n) liveliness: each limb's acceleration over its mean, of all its degrees of freedom in a Gaussian window."""
-    reach = max(int(np.ceil(3.0 * _LIVELINESS_STD_S / dt)), 1)
-    bell = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) * dt / _LIVELINESS_STD_S))
+def _activity(body: Body, dt: float, squares: NDArray, informed: NDArray) -> NDArray:
+    """(T, n) activity: each limb's acceleration over its mean, of all its degrees of freedom in a Gaussian window."""
+    reach = max(int(np.ceil(3.0 * _ACTIVITY_STD_S / dt)), 1)
+    bell = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) * dt / _ACTIVITY_STD_S))
     limb = limbs(body)
     out = np.ones(squares.shape)
     for number in np.unique(limb):

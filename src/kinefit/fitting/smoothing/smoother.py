@@ -16,7 +16,7 @@ from kinefit.fitting.frame.results import UNOBSERVED_STD_RATIO, FrameResult, fra
 from kinefit.fitting.frame.trust import unknown_joints
 from kinefit.fitting.smoothing.border import Border, with_border
 from kinefit.fitting.smoothing.foot_contacts import find_contacts
-from kinefit.fitting.smoothing.process_noise import SmoothTake, estimate, estimate_liveliness
+from kinefit.fitting.smoothing.process_noise import SmoothTake, estimate, estimate_activity
 from kinefit.fitting.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.fitting.smoothing.tracked_frames import TrackedFrames
 from kinefit.fitting.smoothing.unwrap import unwrap
@@ -219,7 +219,7 @@ def _observed(take: SmoothTake) -> tuple[list[NDArray], NDArray]:
 def _estimate(
     take: SmoothTake, settings: TrackSettings, window: int, overlap: int
 ) -> tuple[SmoothTake, int]:
-    """Estimate the noise from a few parts of the take; returns the take with it and its liveliness, and the rounds."""
+    """Estimate the noise from a few parts of the take; returns the take with it and its activity, and the rounds."""
     windows = [whole for whole, _ in parts(len(take.roots), window, overlap)]
     chosen = np.unique(np.linspace(0, len(windows) - 1, _NOISE_PARTS).round().astype(int))
     pieces, rounds = estimate([take.part(windows[i]) for i in chosen], settings.smooth_rounds)
@@ -228,7 +228,7 @@ def _estimate(
     take = replace(take, acceleration=pieces[0].acceleration, pixels=pixels).scaled(pieces[0].scale)
     roots, angles, live = np.array(take.roots), np.array(take.angles), np.array(take.live)
     left = (take.part(whole) for i, whole in enumerate(windows) if i not in done)
-    found = map(estimate_liveliness, left) if take.others is not None else side_by_side(estimate_liveliness, left)
+    found = map(estimate_activity, left) if take.others is not None else side_by_side(estimate_activity, left)
     for i, (whole, kept) in enumerate(parts(len(take.roots), window, overlap)):
         piece = done[i] if i in done else next(found)
         take.pixels.release()

@@ -45,7 +45,7 @@ def fit_marker_steps(
     if not recording.markers_alone or recording.start is not None or recording.others or body.closures:
         return None
     tracker, times, sensors = tracker_of(recording, body, settings), recording.times, set[str]()
-    scene = tracker.scene_of(body.usual_state(np.eye(4)))
+    scene = tracker.scene_of(body.default_state(np.eye(4)))
 
     def measured(i: int) -> list[Measurement]:
         out = tracker.sensors.measurements(recording.steps(i), scene)

@@ -228,7 +228,7 @@ class _OfSensor:
 
 
 class Remains:
-    """Collects what is left over of F frames, in any order.
+    """Collects the residuals of F frames, in any order.
 
     Parameters
     ----------

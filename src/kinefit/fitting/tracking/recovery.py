@@ -66,7 +66,7 @@ class Searching(Protocol):
 
 
 class Recovery:
-    """Searches of one tracker: when the last one was, and since when something is lost.
+    """Searches of one tracker: time of the last search, and since when a segment is lost.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ class Recovery:
         result: FrameResult | None,
     ) -> FrameResult | None:  # fmt: skip
         """A start from points that are known in space, which costs little; from rays as often as a search runs."""
-        scene = tracker.scene_of(self.body.usual_state(np.eye(4)), time)
+        scene = tracker.scene_of(self.body.default_state(np.eye(4)), time)
         known = measurements or tracker.sensors.measurements(frames, scene, points=True)
         rays = result is None or abs(time - self._sought) >= self.settings.search_every - 0.25 / self.rate
         for state in starts_from_points(self.body, known, scene, self.up, rays=rays):
@@ -186,7 +186,7 @@ class Recovery:
         search: PostureSearch | None = None,
     ) -> FrameResult | None:  # fmt: skip
         """A start from what shows a whole person; `search`, where much about the result is left out by it."""
-        state, own = self.body.usual_state(np.eye(4)), tracker.sensors
+        state, own = self.body.default_state(np.eye(4)), tracker.sensors
         scene = tracker.scene_of(state, time).at(state, others=tracker.others)
         elapsed = abs(time - self._good[0])
         known = self._root if elapsed <= _TURN + 1e-6 else None
@@ -269,7 +269,7 @@ class Recovery:
         return not (hidden & seek & trunk).any() and not any(hidden[limb].all() for limb in sought)
 
     def _leap(self, time: float, old: FrameResult, new: FrameResult, seek: NDArray) -> float:
-        """How much faster than a brisk wave a limb would have moved since it was last seen where it was, 1 at least."""
+        """Speed of a limb's jump from its last observed place, over that of a brisk wave; at least 1."""
         elapsed = max(float(np.abs(time - self._good[seek]).max()), 1.0 / self.rate)
         points = self.body.landmarks
         gone = self.body.positions(new.state, points) - self.body.positions(old.state, points)

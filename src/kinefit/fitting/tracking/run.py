@@ -190,7 +190,7 @@ class OtherPeople:
 
     def __init__(self, motions: Sequence[Motion], rig: Rig, within: float) -> None:
         self.motions, self.within = tuple(m for m in motions if m.body.surfaces), within
-        self._scenes = [Scene(m.body, m.body.usual_state(np.eye(4)), rig) for m in self.motions]
+        self._scenes = [Scene(m.body, m.body.default_state(np.eye(4)), rig) for m in self.motions]
 
     def at(self, time: float) -> list[Scene]:
         """Everybody who is there at a time [s]."""

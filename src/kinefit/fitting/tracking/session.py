@@ -69,7 +69,7 @@ class Session:
 
 
 def unseen(last: FrameResult, time: float) -> FrameResult:
-    """A frame that nobody saw, after a result."""
+    """Add a frame without measurements after a result."""
     segments = np.zeros(len(last.hidden), bool)
     return FrameResult(
         time, last.state, np.full_like(last.dof_std, np.inf), np.full_like(last.joint_std, np.inf),

@@ -179,7 +179,7 @@ def _clicked_on_person(frames: Sequence[Any], i: int, seen: Observations, of_per
     return out
 
 
-def from_afar(
+def with_fitted_start(
     recording: Recording, body: Body, settings: TrackSettings | None, *, low_pass: bool = True
 ) -> Recording:
     """A recording whose start, which may be tens of degrees off, is fitted to the silhouettes of its step."""
@@ -254,7 +254,7 @@ def posed_start(take: Take, body: Body, frames: tuple[int, int]) -> tuple[int, B
     T[:3, 2] = z / np.linalg.norm(z)
     T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
     T[:3, 3] = pose.at
-    angles = np.array(body.usual_state(T).angles)
+    angles = np.array(body.default_state(T).angles)
     for name, value in pose.angles.items():
         if name not in tree.coordinates:
             raise wrong(choices(f"angle of body '{body.name}'", name, tree.coordinates))

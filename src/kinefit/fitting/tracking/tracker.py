@@ -98,7 +98,7 @@ class Tracker:
         self.body, self._seen = body, np.full(len(body.tree.coordinates), -np.inf)  # [s] when each was last observed
         self._fit = FrameFit(body, s)
         self._scene = Scene(
-            body, body.usual_state(np.eye(4)), self.rig, values=self.values, samples=s.samples,
+            body, body.default_state(np.eye(4)), self.rig, values=self.values, samples=s.samples,
             unknowns={sensor.name: sensor.unknowns for sensor in self.sensors.own},
         )  # fmt: skip
         self._recovery = Recovery(body, self.rig, self.up, s, self.rate)
@@ -123,7 +123,7 @@ class Tracker:
         return self.sensors.sigma
 
     def know_background(self, sensor: str, depth: NDArray) -> None:
-        """State what a depth camera sees when nobody is there: (H, W) [m], 0 where that is not known.
+        """Set the empty scene of a depth camera: (H, W) [m], 0 where unknown.
 
         Raises
         ------
@@ -140,7 +140,7 @@ class Tracker:
 
     def start_at(self, state: BodyState) -> None:
         """Take a state as that of the last frame; its velocity is unknown. BodyError for another body's."""
-        of_kind(state, BodyState, "the state", "Give body.usual_state(T_world_root), or a state of a Motion.")
+        of_kind(state, BodyState, "the state", "Give body.default_state(T_world_root), or a state of a Motion.")
         if len(state.angles) != len(self.body.tree.coordinates):
             problem = f"the state has {len(state.angles)} angles, the body {len(self.body.tree.coordinates)}"
             raise BodyError(problem, remedy="Give a state of this body.")

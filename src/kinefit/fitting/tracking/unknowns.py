@@ -1,4 +1,4 @@
-"""Which parameters of a person and of sensors a recording can tell, and where the fit of them begins."""
+"""Choose the parameters of a person and of sensors that a recording determines, and their initial values."""
 
 from __future__ import annotations
 

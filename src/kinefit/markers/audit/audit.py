@@ -22,7 +22,7 @@ from kinefit.markers.model.learn import learn_model
 from kinefit.markers.model.model import MarkerModel
 from kinefit.markers.take.consistency import Consistency
 from kinefit.observations import Markers
-from kinefit.solving.rigid_clusters import middle
+from kinefit.solving.rigid_clusters import nan_median
 
 MAX_PARTNERS = 6
 """Other markers whose distances judge a label: those with the least deviation."""
@@ -171,7 +171,7 @@ def _fits_model(markers: Markers, model: MarkerModel) -> bool:
     names = _common_labels(markers, model)
     step = max(1, len(markers) // MAX_SWAP_FRAMES)
     cost = _consistency_of(model, names).own(markers.positions[::step][:, [markers.names.index(n) for n in names]])
-    return bool(np.mean(np.nan_to_num(middle(cost, axis=0)) > INLIER_SIGMAS) < MAX_OUTLIER_SHARE)
+    return bool(np.mean(np.nan_to_num(nan_median(cost, axis=0)) > INLIER_SIGMAS) < MAX_OUTLIER_SHARE)
 
 
 def _consistency_of(model: MarkerModel, labels: Sequence[str]) -> Consistency:
@@ -259,7 +259,7 @@ def _is_better(before: NDArray, after: NDArray, jumps: int) -> bool:
     known = np.isfinite(after).mean(0) > 0.1
     if not known.any():
         return jumps > 1
-    medians = middle(after[:, known], axis=0)
+    medians = nan_median(after[:, known], axis=0)
     earlier = np.nanmedian(np.nan_to_num(before[:, known]), axis=0)
     return bool(medians.min() < INLIER_SIGMAS and medians.max() < OUTLIER_SIGMAS and medians.sum() < earlier.sum())
 
@@ -319,7 +319,7 @@ def _find_strays(positions: NDArray, model: MarkerModel, labels: Sequence[str]) 
     for k, label in enumerate(labels):
         for first, stop in runs_of(misfits[:, k] > OUTLIER_SIGMAS, MAX_GAP):
             last = stop - 1
-            typical = middle(misfits[first : last + 1], axis=0)
+            typical = nan_median(misfits[first : last + 1], axis=0)
             if last - first + 1 < MIN_SPAN_FRAMES or typical[k] < np.nanmax(typical):
                 continue
             x = positions[first : last + 1]

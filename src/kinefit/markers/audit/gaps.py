@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.markers.audit.swaps import interpolate_spans, place_costs
-from kinefit.solving.rigid_clusters import middle, rigid_frames
+from kinefit.solving.rigid_clusters import nan_median, rigid_frames
 
 MAX_ISLAND_FRAMES = 10
 """Longest piece of a trajectory between two gaps that is judged as a whole; of longer ones only the ends are."""
@@ -172,9 +172,9 @@ class _ExpectedPlaces:
             np.repeat(x, each, axis=0), y.reshape(-1, _MAX_CARRIERS, 3), weight=np.repeat(weight, each, axis=0)
         )
         carried = np.einsum("fji,fj->fi", R, at.reshape(-1, 3) - t).reshape(*shape, 3)
-        share = 1.0 / np.abs(middle(away, axis=2))[..., None]
+        share = 1.0 / np.abs(nan_median(away, axis=2))[..., None]
         total = np.nansum(share, axis=1)
-        mean = np.nansum(share * middle(carried, axis=2), axis=1) / np.where(total > 0.0, total, np.nan)
+        mean = np.nansum(share * nan_median(carried, axis=2), axis=1) / np.where(total > 0.0, total, np.nan)
         self._carried.update(zip(places, mean))
 
 

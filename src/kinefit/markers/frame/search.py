@@ -57,7 +57,7 @@ class UnlabelledFrame:
 
 @dataclass(frozen=True, eq=False)
 class JointPrior:
-    """What a parent's choice says about the joint of a segment.
+    """Prior of a segment's joint, given the choice of its parent.
 
     Parameters
     ----------

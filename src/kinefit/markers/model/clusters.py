@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from kinefit.bodies.marker_sets import GIVE, RANGE, bare
 from kinefit.markers.model.from_frame import Skeleton
 from kinefit.markers.model.rigid import joint_residual
-from kinefit.solving.rigid_clusters import local, middle, rigid_frames, shape_of
+from kinefit.solving.rigid_clusters import local, nan_median, rigid_frames, shape_of
 
 MAX_SEGMENT_SIGMA = 0.012
 """[m] largest deviation of the distances within a segment: twice that of the catalogue's markers (0.004 m at each end).
@@ -155,7 +155,7 @@ def marker_sigmas(positions: NDArray, group: set[int]) -> NDArray:
         R, t = rigid_frames(shape_of(positions[:, used]), positions[:, used])
         evaluated = [excluded] if excluded is not None else list(range(positions.shape[1]))
         local_points = local(R, t, positions[:, evaluated])
-        variance = middle(((local_points - middle(local_points, axis=0)) ** 2).sum(-1), axis=0)
+        variance = nan_median(((local_points - nan_median(local_points, axis=0)) ** 2).sum(-1), axis=0)
         out[evaluated] = np.where(np.isfinite(variance), np.sqrt(variance / 3), np.inf)
     return out
 
@@ -231,7 +231,7 @@ def joint_costs(positions: NDArray, groups: list[set[int]], deviation: NDArray) 
             near = np.linalg.norm(
                 positions[:, sorted(groups[a])][:, :, None] - positions[:, sorted(groups[b])][:, None], axis=-1
             )
-            near = np.nanmin(middle(near, axis=0)) if np.isfinite(near).any() else np.inf
+            near = np.nanmin(nan_median(near, axis=0)) if np.isfinite(near).any() else np.inf
             cost[a, b] = cost[b, a] = cost[a, b] + 0.1 * near
     return cost
 

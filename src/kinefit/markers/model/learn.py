@@ -16,7 +16,7 @@ from kinefit.markers.model.clusters import learn_segments
 from kinefit.markers.model.model import MarkerJoint, MarkerModel
 from kinefit.markers.model.rigid import exercised_share, fit_joint, joint_ranges, reference_turn
 from kinefit.observations import Markers
-from kinefit.solving.rigid_clusters import middle, rigid_frames
+from kinefit.solving.rigid_clusters import nan_median, rigid_frames
 
 MAX_FRAMES = 1000
 """Frames used, spread over the take: consecutive frames are alike."""
@@ -250,7 +250,7 @@ def mean_shape(positions: NDArray, segments: tuple[tuple[int, ...], ...], mean: 
             R, t = rigid_frames(shape, y, prior)
             local_points = np.einsum("fji,fkj->fki", R, y - t[:, None])
             finite = np.isfinite(local_points[..., 0])
-            typical = middle(np.where(finite[..., None], local_points, np.nan), axis=0)
+            typical = nan_median(np.where(finite[..., None], local_points, np.nan), axis=0)
             shape = np.where(np.isfinite(typical), typical, shape)
         R, t = rigid_frames(shape, frame[None, index], prior[:1])
         if np.isfinite(t).all():

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from kinefit.geometry.se3 import exp_so3, log_so3, nearest_rotation
 from kinefit.markers.model.model import MarkerJoint
-from kinefit.solving.rigid_clusters import local, middle
+from kinefit.solving.rigid_clusters import local, nan_median
 
 SECOND_AXIS_RATIO = 0.35
 """Range of a ball joint about its second axis over that about its first: a hip flexes through 130 degrees and spreads
@@ -69,7 +69,7 @@ def fit_joint_few(Rp: NDArray, tp: NDArray, x: NDArray, y: NDArray, guess: NDArr
     for _ in range(5):
         away = local - a
         length = np.linalg.norm(away, axis=-1)
-        typical = middle(length, axis=0)
+        typical = nan_median(length, axis=0)
         J = -away / np.maximum(length, 1e-9)[..., None]
         r = typical - length
         finite = np.isfinite(r)
@@ -79,7 +79,7 @@ def fit_joint_few(Rp: NDArray, tp: NDArray, x: NDArray, y: NDArray, guess: NDArr
         a = a + np.linalg.solve(J.T @ J / len(r) + 0.02 * np.eye(3), J.T @ r / len(r) + 0.02 * (guess - a))
     # in the child's frame: the point at these distances from its markers that is nearest to the parent's
     b = a.copy()
-    typical = middle(np.linalg.norm(local - a, axis=-1), axis=0)
+    typical = nan_median(np.linalg.norm(local - a, axis=-1), axis=0)
     for _ in range(10):
         away = b - x
         length = np.linalg.norm(away, axis=-1)
@@ -104,7 +104,7 @@ def joint_residual(parent: tuple[NDArray, ...], child: tuple[NDArray, ...] | Non
         if valid.sum() < 3:
             return np.inf
         start = np.concatenate([local(Rp[valid], tp[valid], y[valid]).mean((0, 1)), np.zeros(3)])
-        start[3:] = middle(local(Rc[valid], tc[valid], y[valid]), axis=(0, 1))
+        start[3:] = nan_median(local(Rc[valid], tc[valid], y[valid]), axis=(0, 1))
         _, residuals = _least_squares(Rp[valid], tp[valid], Rc[valid], tc[valid], np.nan_to_num(start), 1e-3)
         return float(np.sqrt(np.median((residuals**2).sum(1))))
     local_points = local(Rp, tp, y)
@@ -113,7 +113,7 @@ def joint_residual(parent: tuple[NDArray, ...], child: tuple[NDArray, ...] | Non
         return np.inf
     a, _ = fit_joint_few(Rp, tp, y[frame] if np.isfinite(y[frame]).all() else guess, y, np.nanmean(guess, axis=0))
     length = np.linalg.norm(local_points - a, axis=-1)
-    return float(np.sqrt(np.nanmedian((length - middle(length, axis=0)) ** 2))) if len(length) else np.inf
+    return float(np.sqrt(np.nanmedian((length - nan_median(length, axis=0)) ** 2))) if len(length) else np.inf
 
 
 def _turns(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[NDArray, NDArray, NDArray] | None:

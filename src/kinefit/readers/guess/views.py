@@ -131,8 +131,7 @@ def one_person(record: Keypoints, frames: NDArray) -> NDArray:
     """(F, K, 2) [px] points of the largest confident person in some frames; NaN where not detected."""
     points, confidence = record.points[frames], record.confidence[frames]
     points = np.where((confidence > _MIN_CONFIDENCE)[..., None], points, np.nan)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a frame without people is all NaN
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a frame without people is all NaN
         extent = np.linalg.norm(np.nanmax(points, axis=2) - np.nanmin(points, axis=2), axis=-1)
     score = np.nan_to_num(extent) * np.isfinite(points[..., 0]).sum(-1)
     return points[np.arange(len(frames)), np.argmax(score, axis=1)]

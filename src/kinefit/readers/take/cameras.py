@@ -67,7 +67,7 @@ class TakeCameras:
 
     @property
     def fastest(self) -> float | None:
-        """Rate [Hz] of the take's steps, as far as its streams tell it."""
+        """Rate [Hz] of the take's steps, from its streams; None if unknown."""
         return self.take.rate or max(self.rates.values(), default=None)
 
 
@@ -77,17 +77,17 @@ def is_alone(take: Take) -> bool:
 
 
 def is_uncalibrated(take: Take) -> bool:
-    """Whether a take has several cameras and nothing that tells where they stand but the people in view."""
+    """Whether a take has several cameras whose poses only the people in view can determine."""
     return take.calibration is None and len(take.cameras) > 1
 
 
 def is_level(take: Take) -> bool:
-    """Whether a calibration tells the vertical; cameras found from people or taken to look level do not."""
+    """Whether a calibration determines the vertical; cameras found from people or assumed level do not."""
     return not (is_alone(take) or (is_uncalibrated(take) or found_notes(take.calibration)))
 
 
 def assumed_camera(entry: CameraEntry, size: tuple[int, int] | None, take: Take) -> Camera:
-    """The camera as the take tells it, or as cameras usually are.
+    """The camera as the take states it, else with default intrinsics.
 
     It looks level, along the axis before the vertical one: y where z is up, x where y is.
 
@@ -147,7 +147,7 @@ def read_rig(take: Take, exteriors: bool = True) -> Rig | None:
 
 
 def calibrated_size(take: Take, name: str) -> tuple[int, int] | None:
-    """(width, height) [px] of a camera's image, for a calibration that does not state it; None where nothing tells it.
+    """(width, height) [px] of a camera's image, for a calibration that does not state it; None if unknown.
 
     It is that of the camera's video, or its `size`, unless the take says that the image is not the calibration's. A
     camera that the take leaves out has a size that nobody asks for: (1, 1).

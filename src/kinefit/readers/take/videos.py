@@ -73,7 +73,7 @@ def _pair(take: Take, seen: Observations, entry: StereoEntry) -> DepthVideo:
 
 
 class TakePictures:
-    """The pictures of a take's videos, for whoever wants to look at some of them; opened where one is asked for.
+    """Images of a take's videos on demand; a video is opened when its first image is requested.
 
     Parameters
     ----------

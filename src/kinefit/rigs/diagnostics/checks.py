@@ -264,7 +264,7 @@ def _mistakes(c: Checked) -> list[Finding]:
 
 
 def _unseen(c: Checked) -> list[Finding]:
-    """Cameras in which nobody was detected, which are left out."""
+    """Cameras without any detection, which are excluded."""
     seen = dict(zip(c.views.rig.names, np.isfinite(c.views.uv).any(axis=(0, 1, 3)), strict=True))
     c.views, findings = c.views.select([name for name in seen if seen[name]]), []
     c.sound = len(c.views.rig) > 0

@@ -27,7 +27,7 @@ _SEARCH_HZ = 4.0  # of depth images that are compared
 
 
 def without_frozen(seen: Observations) -> tuple[Observations, list[Finding]]:
-    """Drop the repeated frames of streams that froze; and a doubt for each, with the frames and times."""
+    """Exclude the repeated frames of frozen streams; a doubt on each names frames and times."""
     findings = list[Finding]()
 
     def thawed(record: Any, sensor: str, drop: Callable[[Any, NDArray], Any]) -> Any:

@@ -114,7 +114,7 @@ def _altered(camera: Camera, seen: Detections, begin: float) -> Iterator[tuple[i
 
 
 def _frames_in_common(a: LiftedSkeleton, b: LiftedSkeleton) -> int:
-    """Most frames in which both show somebody, of all clocks that may be."""
+    """Largest number of frames with a person in both, over all possible clock offsets."""
     one, other = (np.pad(s.weight.any(axis=1).astype(int), round(_CLOCKS_S * _RATE)) for s in (a, b))
     most = round(_CLOCKS_S * _RATE)
     length = min(len(one), len(other)) - 2 * most

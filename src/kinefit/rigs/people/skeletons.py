@@ -334,7 +334,7 @@ def _laid(a: LiftedSkeleton, b: LiftedSkeleton, lag: int) -> NDArray:
 
 
 def steady_person(record: Keypoints) -> Keypoints:
-    """The same person of one camera in all frames: the one seen best, and whoever is nearest to where that one was.
+    """One person of a camera in all frames: the most confident one, then the nearest to the last position.
 
     Raises
     ------

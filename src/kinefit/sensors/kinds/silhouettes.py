@@ -158,7 +158,7 @@ def _check_shape(size: tuple[int, int], wanted: tuple[int, int], file: Path) -> 
 
 @dataclass(frozen=True, eq=False)
 class MaskCode:
-    """Which values of a recording's mask images are the body, as some of its images tell.
+    """Which values of mask images are the body, estimated from some of the recording's images.
 
     Parameters
     ----------

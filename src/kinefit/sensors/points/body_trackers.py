@@ -129,12 +129,12 @@ class BodyTrackerMeasurement(Measurement):
         return self.of.name
 
     def match(self, scene: Scene, reach: float) -> BodyTrackerMatched:
-        """As they are named."""
+        """Match trackers by their names."""
         scale = MARKER_LOSS.scale * max(reach / _REFERENCE_DISTANCE_M, 1.0)
         return BodyTrackerMatched(self, replace(MARKER_LOSS, scale=scale))
 
     def hints(self, scene: Scene) -> Hints:
-        """Where they are, and points ahead along their axes where their orientation is known."""
+        """Places of the trackers, and points along their axes where orientations are known."""
         points = self.of.places(scene.body, self.names)
         axes = _LEVER * self.of.mounted(self.names, scene).swapaxes(1, 2)
         x = self.x_world[:, None] + _LEVER * self.Rs_world_tracker.swapaxes(1, 2)
@@ -179,7 +179,7 @@ class BodyTrackerMatched(Matched):
         return [replace(rows, loss=self.loss) for rows in out]
 
     def leftovers(self, scene: Scene) -> list[Leftover]:
-        """Of every tracker's place; orientations weigh the channels, and are no lengths."""
+        """Residuals of every tracker's place; orientations are no lengths and have none."""
         m = self.measurement
         points = m.of.places(scene.body, m.names)
         values = m.x_world - scene.positions(points)

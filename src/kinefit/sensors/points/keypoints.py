@@ -22,13 +22,13 @@ from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evid
 from kinefit.sensors.points.views import (
     HandViews,
     ViewBias,
-    beside,
     find_swaps,
     join_fingers,
     limb_groups,
     rays,
     triangulated_frame,
     trunks,
+    view_offset,
 )
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.visibility.occlusion import MIN_VISIBLE_CONFIDENCE, Hidden, hidden_points
@@ -87,13 +87,13 @@ class Layout:
         """(N,) segment in whose frame a channel's view bias is given."""
         return trunks(self.body.tree)[self.points.segments]
 
-    def beside(self, scene: Scene) -> NDArray | None:
+    def bias(self, scene: Scene) -> NDArray | None:
         """(N, 2) [px] bias of each keypoint in the image at a scene's state; None without a `view_bias`."""
         bias = self.channels.view_bias
         if bias is None:
             return None
         x = scene.positions(self.points_of(scene.body))
-        return beside(bias, self.trunk, x, scene.frames, scene.rig, self.channels.camera)
+        return view_offset(bias, self.trunk, x, scene.frames, scene.rig, self.channels.camera)
 
     def points_of(self, body: Body) -> PointSet:
         """`points` of another body with the same segments; cached for the latest body."""
@@ -246,13 +246,13 @@ class KeypointMeasurement(Measurement):
         """Left and right of each source as they fit the body better; which points another sensor saw to be hidden."""
         channels = self.layout.channels
         fitted = projected(scene, self.layout)
-        beside = self.layout.beside(scene)
-        looked_for = fitted if beside is None else fitted + beside
+        view_offset = self.layout.bias(scene)
+        looked_for = fitted if view_offset is None else fitted + view_offset
         swapped = find_swaps(channels, self.layout.groups, self.uv, self.weight, looked_for, self.sides_known)
         order = np.where(swapped, channels.partner, np.arange(len(swapped)))
         uv, weight = np.ascontiguousarray(self.uv[order]), np.ascontiguousarray(self.weight[order])
-        if beside is not None:
-            uv -= beside
+        if view_offset is not None:
+            uv -= view_offset
         hidden: tuple[Hidden, ...] = ()
         if scene.measurements:
             sure = self.confidence[order] >= MIN_VISIBLE_CONFIDENCE
@@ -260,7 +260,7 @@ class KeypointMeasurement(Measurement):
         loss, near = self.of.loss, self.of.near
         if reach > near:
             loss = replace(loss, scale=loss.scale * reach / near)
-        return KeypointMatched(self, uv, weight, swapped, loss, hidden, beside)
+        return KeypointMatched(self, uv, weight, swapped, loss, hidden, view_offset)
 
     def hints(self, scene: Scene) -> Hints:
         """Points on which two cameras agree, and a ray of each point from a camera that sees it."""
@@ -280,7 +280,7 @@ class KeypointMatched(Matched):
     swapped : (N,) bool, channels exchanged with their partner
     loss : Loss
     hidden : what other sensors measured in front of points
-    beside : (N, 2) [px] the bias by view that was taken out; None for none
+    view_offset : (N, 2) [px] the bias by view that was taken out; None for none
     """
 
     measurement: KeypointMeasurement
@@ -289,7 +289,7 @@ class KeypointMatched(Matched):
     swapped: NDArray
     loss: Loss
     hidden: tuple[Hidden, ...] = ()
-    beside: NDArray | None = None
+    view_offset: NDArray | None = None
 
     sensor = KEYPOINTS
 
@@ -352,7 +352,7 @@ class KeypointMatched(Matched):
         layout, seen = self.measurement.layout, self.weight > 0
         uv = np.where(seen[:, None], self.uv, np.nan)
         values = uv - projected(scene, layout)
-        uv = uv if self.beside is None else uv + self.beside  # as it was measured
+        uv = uv if self.view_offset is None else uv + self.view_offset  # as it was measured
         factor = np.where(seen, self.loss.factor(self.squares(scene)), 0.0)
         return [
             Leftover(
@@ -385,7 +385,7 @@ class KeypointMatched(Matched):
         return size * gap, size * channels.sigma
 
     def _elsewhere(self, right: NDArray, wrong: NDArray) -> NDArray | None:
-        """(S,) bool: segments whose own points most views show beside where they should be, two of them in one place.
+        """(S,) bool: segments whose points most views show elsewhere, two of these views in one place.
 
         A joint's point counts for the segment beyond the joint alone: an elbow may be off where shoulder and hand are
         right.

@@ -186,5 +186,5 @@ class LiftedMatched(Matched):
         return [PairRows(bones.against, x, ref, np.broadcast_to(self.ray, x.shape), residual, weight)]
 
     def evidence(self, scene: Scene) -> Evidence:
-        """Nothing for a segment or against it: what they are off by lasts, and says little of any one."""
+        """No evidence for or against a segment: errors of lifted landmarks are correlated over time."""
         return Evidence(*np.zeros((2, len(scene.body.tree.segments))))

@@ -81,10 +81,10 @@ class ViewBias:
         return cls({s: {n: np.array(c, float) for n, c in points.items()} for s, points in record.items()})
 
 
-def beside(
+def view_offset(
     coefficients: NDArray, trunk: NDArray, x_world: NDArray, frames: NDArray, rig: Rig, camera: NDArray
 ) -> NDArray:
-    """(N, 2) [px] how far beside their points keypoints are seen; 0 where a point cannot be seen.
+    """Offsets (N, 2) [px] at which keypoints are seen from their points; 0 where a point cannot be seen.
 
     Parameters
     ----------

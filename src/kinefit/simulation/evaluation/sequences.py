@@ -17,7 +17,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.detectors.skin import LANDMARKS, SkinTracker, face_box
 from kinefit.observations import MEDIAPIPE_33, DepthFrame, Frame, KeypointFrame
 from kinefit.sensors.channels import joined
-from kinefit.simulation.figures import beside, in_front
+from kinefit.simulation.figures import in_front, shifted_camera
 from kinefit.simulation.movements import MOVEMENTS, Performer, movement, people
 from kinefit.simulation.rendering.scenes import ColourSensor, SimulatedScene, picture
 from kinefit.simulation.rendering.sensors import TOF, DepthSensor, measured_depth
@@ -243,7 +243,7 @@ def sequence_of(
     """Simulate the sensors for a known motion of a body `with_hands`; see `sequences`."""
     camera = in_front(truth, sensor.camera(name="depth"), azimuth=person.azimuth, near=sensor.near, far=sensor.far)
     head = ColourSensor("colour", _HEAD_SIZE, _HEAD_SIZE[1] / sensor.size[1] * sensor.focal, samples=1)
-    colour = beside(head.camera().with_pose(camera.T_camera_world), "colour", _BASELINE)
+    colour = shifted_camera(head.camera().with_pose(camera.T_camera_world), "colour", _BASELINE)
     scene = SimulatedScene.of(truth, camera if room else None)
     depth = []
     for frame, time in enumerate(truth.times):

@@ -16,7 +16,7 @@ from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
-from kinefit.simulation.figures import beside, places
+from kinefit.simulation.figures import places, shifted_camera
 
 PARTS = ("floor", "wall", "table")
 _BACK_WALL_DISTANCE = 1.0  # [m] from the body to the wall behind it
@@ -292,7 +292,7 @@ class StereoSensor(ColourSensor):
 
     def pair(self, left: Camera) -> tuple[Camera, Camera]:
         """The left camera and the right one."""
-        return left, beside(left, f"{self.name}_right", self.baseline)
+        return left, shifted_camera(left, f"{self.name}_right", self.baseline)
 
 
 COLOUR = ColourSensor("colour", (640, 480), 575.0)

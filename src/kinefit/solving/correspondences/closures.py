@@ -117,7 +117,7 @@ def _gear_sigma(body: Body) -> NDArray:
         if d.std > 0.0:
             step = 0.1 * d.std
             changed = [with_dimensions(body, {d.name: d.value + s * step}) for s in (1.0, -1.0)]
-            ends = [closure_values(b, body.usual_state()) for b in changed]
+            ends = [closure_values(b, body.default_state()) for b in changed]
             variance += np.square((ends[0] - ends[1]) / (2.0 * step) * d.std)
     out = np.sqrt(variance)
     out[out < 1e-9] = 0.0

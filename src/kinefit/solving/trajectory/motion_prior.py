@@ -22,7 +22,7 @@ class MotionPrior:
         Standard deviation of the posture prior.
     couplings : (C, D) [1/rad or 1/m], optional
         Correlated departures from the mean, see `KinematicTree`.
-    liveliness : (T, n), optional
+    activity : (T, n), optional
         Factor on `acceleration` for every r_s; the last one is not used.
     """
 
@@ -31,7 +31,7 @@ class MotionPrior:
     dt: float
     mean: NDArray
     spread: NDArray
-    liveliness: NDArray | None = None
+    activity: NDArray | None = None
     couplings: NDArray | None = None
 
     @property
@@ -64,8 +64,8 @@ class MotionPrior:
         fast, slow = self.keep
         past = np.tile([fast + slow, -fast * slow], (count, 1))
         weight = np.tile(self.weight, (count, 1))
-        if self.liveliness is not None:
-            weight /= np.square(self.liveliness[:count])
+        if self.activity is not None:
+            weight /= np.square(self.activity[:count])
         past[:1], past[1:2] = 0.0, [(fast + slow) / (1 + fast * slow), 0.0]
         weight[:1] *= (1 - fast * slow) * ((1 + fast * slow) ** 2 - (fast + slow) ** 2) / (1 + fast * slow)
         weight[1:2] *= 1 - (fast * slow) ** 2

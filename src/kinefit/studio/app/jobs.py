@@ -164,7 +164,7 @@ class JobQueue:
         return job
 
     def start_beside(self, take: Path, command: Sequence[str], environment: Mapping[str, str]) -> Job:
-        """Run a command at once, whatever the queue does."""
+        """Run a command immediately, outside of the queue."""
         job = Job(take, tuple(command), environment=dict(environment))
         self.beside = [*(old for old in self.beside if old.is_open), job]
         task = asyncio.create_task(_run(job))

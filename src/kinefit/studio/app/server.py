@@ -105,8 +105,7 @@ def serve(root: Path, port: int, access: Access, opened: Callable[[int], None]) 
         NiceGUI is missing, or no port is free.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)
+        with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
             import uvicorn
             from fastapi import FastAPI
             from nicegui import app as pages

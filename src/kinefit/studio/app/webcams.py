@@ -1,4 +1,4 @@
-"""Cameras of this computer: which there are, a take file for `kinefit live`, and videos of them to calibrate by."""
+"""Find the cameras of this computer, write their take file, and record videos to calibrate them."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ class Recorder(Inbox):
             source.start(self)
 
     def put(self, frame: Arrived, *, wait: bool = False) -> bool:
-        """Take an image of a camera; one that comes while too many are not written yet is dropped."""
+        """Queue an image of a camera; it is dropped while too many wait to be written."""
         if self._images[frame.sensor].full():
             self.lose(frame.sensor)
         else:

@@ -1,4 +1,4 @@
-"""Packets that a live session sends to its receivers, and wishes that it gets; docs/live.md describes them."""
+"""Packets that a live session sends to its receivers, and requests that it gets; docs/live.md describes them."""
 
 from __future__ import annotations
 
@@ -71,10 +71,10 @@ class PosePacket:
 
 
 Answer = Callable[[Mapping[str, Any]], None]
-"""Callback for the answer to a wish, called from any thread."""
+"""Callback for the answer to a request, called from any thread."""
 
-MAX_WISH_BYTES = 4096
-"""Largest size of a wish as JSON; valid ones have less than 300 bytes."""
+MAX_REQUEST_BYTES = 4096
+"""Largest size of a request as JSON; valid ones have less than 300 bytes."""
 
 _Name = Annotated[str, msgspec.Meta(max_length=200)]
 _FORM = (
@@ -84,7 +84,7 @@ _FORM = (
 _SINGLE_FIELDS = "body", "person", "pause", "stop"
 
 
-class Wish(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+class ClientRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """One request; the fields of other requests are None.
 
     Parameters
@@ -107,26 +107,26 @@ class Wish(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     stop: bool | None = None
 
 
-def read_wish(given: bytes | Mapping[str, Any]) -> Wish:
-    """Parse a wish from a JSON text or a mapping.
+def read_request(given: bytes | Mapping[str, Any]) -> ClientRequest:
+    """Parse a request from a JSON text or a mapping.
 
     The record has no nested fields, so deep nesting in the input has no effect.
 
     Raises
     ------
     ObservationError
-        Too long, no JSON, no valid wish, or two wishes at once.
+        Too long, no JSON, no valid request, or two requests at once.
     """
     try:
         if isinstance(given, Mapping):
-            wish = msgspec.convert(dict(given), Wish)
-        elif len(given) > MAX_WISH_BYTES:
-            raise ObservationError(f"the request has {len(given)} bytes, more than {MAX_WISH_BYTES}", remedy=_FORM)
+            request = msgspec.convert(dict(given), ClientRequest)
+        elif len(given) > MAX_REQUEST_BYTES:
+            raise ObservationError(f"the request has {len(given)} bytes, more than {MAX_REQUEST_BYTES}", remedy=_FORM)
         else:
-            wish = msgspec.json.decode(given, type=Wish)
+            request = msgspec.json.decode(given, type=ClientRequest)
     except msgspec.DecodeError as error:
         raise ObservationError(f"not a request: {error}", remedy=_FORM) from error
-    asked = {name for name in wish.__struct_fields__ if getattr(wish, name) is not None}
-    if asked not in ({"sensor", "use"}, {"sensor", "sigma"}, *({one} for one in _SINGLE_FIELDS)) or wish.stop is False:
+    asked = {name for name in request.__struct_fields__ if getattr(request, name) is not None}
+    if asked not in ({"sensor", "use"}, {"sensor", "sigma"}, *({f} for f in _SINGLE_FIELDS)) or request.stop is False:
         raise ObservationError(f"a message with {', '.join(sorted(asked)) or 'nothing'} is not a request", remedy=_FORM)
-    return wish
+    return request

@@ -22,14 +22,14 @@ from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.observations import Keypoints
 from kinefit.studio.live.cameras import Arrived, Inbox, LiveDetector
 from kinefit.studio.live.folders import REPLAY
-from kinefit.studio.live.packets import Answer, PosePacket, Wish, read_wish
+from kinefit.studio.live.packets import Answer, ClientRequest, PosePacket, read_request
 from kinefit.studio.live.people import LivePerson, LiveSize
 from kinefit.studio.live.record import SeenRecord
 
 _MAX_LATENCIES = 10_000  # that are stored
 _PATIENCE_WITHOUT_DROPS_S = 10.0  # wait for the other sensors, if no frame may be dropped
-_MAX_WAIT_S = 0.25  # between two checks of the clients' wishes
-_MAX_WAITING_WISHES = 64  # of all clients: two seconds, at one a step
+_MAX_WAIT_S = 0.25  # between two checks of the clients' requests
+_MAX_WAITING_REQUESTS = 64  # of all clients: two seconds, at one a step
 
 
 class Source(Protocol):
@@ -77,7 +77,7 @@ class LiveSession:
     inbox : Inbox
     processed, found : int, number of steps, and of those in which the person was found
     latencies : [s] of the latest steps, from the arrival of the newest frame until all receivers have the pose
-    wishes : queue of clients' requests, see `ask`
+    requests : queue of clients' requests, see `ask`
     """
 
     def __init__(
@@ -93,8 +93,8 @@ class LiveSession:
         self.inbox = Inbox(self.sensors, patience=patience)
         self.processed = self.found = 0
         self.latencies: deque[float] = deque(maxlen=_MAX_LATENCIES)
-        self.wishes: queue.Queue[tuple[Wish, Answer]] = queue.Queue(_MAX_WAITING_WISHES)
-        self._replaced: tuple[Body, Wish, Answer] | None = None  # until a step is fitted with the requested body
+        self.requests: queue.Queue[tuple[ClientRequest, Answer]] = queue.Queue(_MAX_WAITING_REQUESTS)
+        self._replaced: tuple[Body, ClientRequest, Answer] | None = None  # until a step is fitted with that body
         self._off: set[str] = set()
         self._choices = 0  # of another person
         self._paused = self._over = False
@@ -171,23 +171,23 @@ class LiveSession:
             self.change_body(body)
         return result
 
-    def ask(self, wish: bytes | Mapping[str, Any], answer: Answer = lambda content: None) -> None:
+    def ask(self, request: bytes | Mapping[str, Any], answer: Answer = lambda content: None) -> None:
         """Request a change before one of the next steps; callable from any thread.
 
         Parameters
         ----------
-        wish : as JSON or as a mapping
+        request : as JSON or as a mapping
             {"sensor": name, "use": bool}: whether to use a sensor; {"sensor": name, "sigma": value}: its standard
             deviation [px, m]; {"body": name}: another body of the catalogue; {"person": number}: track another person,
             and record that person alone; {"pause": true or false}; {"stop": true}.
-        answer : called with {"type": "done"} or {"type": "refused", "why": text}, with the wish as "asked"
+        answer : called with {"type": "done"} or {"type": "refused", "why": text}, with the request as "asked"
         """
         try:
-            self.wishes.put_nowait((read_wish(wish), answer))
+            self.requests.put_nowait((read_request(request), answer))
         except KinefitError as error:
             answer({"type": "refused", "why": str(error)})
         except queue.Full:
-            answer({"type": "refused", "why": f"{_MAX_WAITING_WISHES} requests are waiting. Send it again later."})
+            answer({"type": "refused", "why": f"{_MAX_WAITING_REQUESTS} requests are waiting. Send it again later."})
 
     def change_body(self, body: Body) -> None:
         """Continue with another body.
@@ -213,8 +213,8 @@ class LiveSession:
         except KinefitError as error:
             if self._replaced is None:
                 raise
-            (before, wish, answer), self._replaced = self._replaced, None
-            answer(_refused(wish, error))
+            (before, request, answer), self._replaced = self._replaced, None
+            answer(_refused(request, error))
             self.change_body(before)
             return self._track(frames, records)
         if of_person:
@@ -246,15 +246,15 @@ class LiveSession:
         return frames, records
 
     def _listen(self) -> None:
-        """Fulfil one wish of a client: more would delay poses."""
+        """Fulfil one request of a client: more would delay poses."""
         with contextlib.suppress(queue.Empty):
-            wish, answer = self.wishes.get_nowait()
+            request, answer = self.requests.get_nowait()
             try:
-                self._fulfil(wish, answer)
+                self._fulfil(request, answer)
             except KinefitError as error:
-                answer(_refused(wish, error))
+                answer(_refused(request, error))
             else:
-                answer({"type": "done", "asked": msgspec.to_builtins(wish)})
+                answer({"type": "done", "asked": msgspec.to_builtins(request)})
 
     def _choose(self, number: int) -> None:
         """Track another person, with files and size of that person alone."""
@@ -266,25 +266,25 @@ class LiveSession:
                 if part is not None:
                     part.restart()
 
-    def _fulfil(self, wish: Wish, answer: Answer) -> None:
-        if wish.stop:
+    def _fulfil(self, request: ClientRequest, answer: Answer) -> None:
+        if request.stop:
             self.stop()
-        elif wish.pause is not None:
-            self._paused = wish.pause
-        elif wish.person is not None:
-            self._choose(wish.person)
-        elif wish.body is not None:
-            check_choice("body of the catalogue", wish.body, catalogue(), BodyError)
+        elif request.pause is not None:
+            self._paused = request.pause
+        elif request.person is not None:
+            self._choose(request.person)
+        elif request.body is not None:
+            check_choice("body of the catalogue", request.body, catalogue(), BodyError)
             before = self._replaced[0] if self._replaced else self.tracker.body
-            self.change_body(load_body(wish.body))
-            self._replaced = before, wish, answer
-        elif wish.sensor not in self.names:
-            raise ObservationError(choices("sensor", str(wish.sensor), self.names))
-        elif wish.sigma is not None:
-            self.tracker.set_sigma(wish.sensor, wish.sigma)
+            self.change_body(load_body(request.body))
+            self._replaced = before, request, answer
+        elif request.sensor not in self.names:
+            raise ObservationError(choices("sensor", str(request.sensor), self.names))
+        elif request.sigma is not None:
+            self.tracker.set_sigma(request.sensor, request.sigma)
         else:
-            (self._off.discard if wish.use else self._off.add)(wish.sensor)
+            (self._off.discard if request.use else self._off.add)(request.sensor)
 
 
-def _refused(wish: Wish, error: KinefitError) -> dict[str, Any]:
-    return {"type": "refused", "asked": msgspec.to_builtins(wish), "why": str(error)}
+def _refused(request: ClientRequest, error: KinefitError) -> dict[str, Any]:
+    return {"type": "refused", "asked": msgspec.to_builtins(request), "why": str(error)}

@@ -1,4 +1,4 @@
-"""Decide who may connect to a server that kinefit opens, and what its pages may do; docs/live.md tells users."""
+"""Decide who may connect to a server of kinefit, and what its pages may do; docs/live.md describes the rules."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class Access:
 
     @property
     def warning(self) -> str | None:
-        """What to tell the user of a server that a network reaches; None for one of this computer alone."""
+        """Warning for a server that a network reaches; None for one of this computer alone."""
         if self.is_local:
             return None
         return (

@@ -29,7 +29,7 @@ MAX_FRAMES_AT_ONCE = 60.0
 """Of one client, after it was quiet for two seconds; 8 KiB count as one frame, too. Who sends more is disconnected."""
 
 MAX_FRAMES_PER_SECOND = 30.0
-"""Of one client on average: as many wishes as a camera has images."""
+"""Of one client on average: as many requests as a camera has images."""
 
 _FRAME_BYTES = 8192.0  # that count as one frame
 _SLICE_BYTES = 1024  # of what arrived, until its frames are counted: 170 of the smallest, 2 ms
@@ -61,7 +61,7 @@ class Page(NamedTuple):
 
 
 class Allowance:
-    """A number of things that may happen at once, and grows again at a rate."""
+    """Token bucket: a burst of events, refilled at a constant rate."""
 
     def __init__(self, at_once: float, per_second: float) -> None:
         self._left = self._most = at_once

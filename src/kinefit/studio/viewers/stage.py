@@ -1,4 +1,4 @@
-"""The stage: a server with a scene, floor, cameras with their images, what stands behind the person."""
+"""Server of a 3D scene: floor, cameras with their images, and the image behind the person."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _MAX_CACHE_BYTES = 96_000_000  # bytes of pictures that are kept
 
 @dataclass(frozen=True, eq=False)
 class PinholeView:
-    """What a camera sees, as a flat picture: a pinhole with its axis in the middle that covers the whole image.
+    """A camera's view without distortion: a centred pinhole camera that covers the whole image.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def flatten(picture: NDArray[np.uint8], pixels: NDArray) -> NDArray[np.uint8]:
 
 
 class CameraImages:
-    """Flat pictures of cameras over time, decoded on demand; the last ones are kept.
+    """Undistorted images of cameras over time, decoded on demand; the last ones are cached.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ _MIN_DISTANCE = 1.0  # [m] of the first look: parts of a body are not seen from 
 
 
 def open_server(port: int, access: Access | None = None, *, label: str = "kinefit") -> viser.ViserServer:
-    """A server on a port, or on the next one that is free; `get_port()` tells which.
+    """A server on a port, or on the next one that is free; `get_port()` returns its number.
 
     Parameters
     ----------

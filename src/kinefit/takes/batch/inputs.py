@@ -43,6 +43,5 @@ def is_outdated(provenance: Mapping[str, Any], take: Path) -> bool:
 @lru_cache(1024)
 def _read(take: Path, changed: int) -> Take:
     """The take file of this change [ns]: the window's lists ask for the same ones every two seconds."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # old keys were said when the take was tracked
+    with warnings.catch_warnings(action="ignore", category=FutureWarning):  # old keys were reported when it was tracked
         return read_take(take)

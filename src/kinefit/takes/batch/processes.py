@@ -28,13 +28,13 @@ _PIPES: list[Connection] = []  # of a worker process, to the process that waits 
 
 
 class _Beat:
-    """What a worker sends while its job goes on."""
+    """Message of a worker whose job is running."""
 
     last = 0.0  # time.monotonic() of the worker
 
 
 def progress(*_: object) -> None:
-    """Report that the job of this worker goes on: in place of a `Step`. Elsewhere it does nothing."""
+    """Report progress of this worker's job, in place of a `Step`; outside of a worker nothing happens."""
     with _SENDING:
         if _PIPES and time.monotonic() - _Beat.last > _BEAT_INTERVAL_S:
             _Beat.last = time.monotonic()

@@ -264,7 +264,7 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
 
 
 def _name_of(quality: str | Path) -> str:
-    """What tells results of a quality, or of a network's file, from those of another."""
+    """Name that distinguishes results by quality, or by the network's file."""
     if isinstance(quality, str):
         return quality
     try:
@@ -302,7 +302,7 @@ def _fits(
 
 @contextmanager
 def hushed() -> Iterator[None]:
-    """Let LiteRT say here, once and to nobody, how it runs: it writes that past Python on stderr, amid the progress."""
+    """Discard what LiteRT writes to stderr outside of Python: a message on how it runs, amid the progress."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:

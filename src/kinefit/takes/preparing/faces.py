@@ -76,7 +76,7 @@ def _between(a: NDArray, b: NDArray, share: float) -> NDArray:
 
 
 class HiddenVideo(Video):
-    """A video in whose images nobody's face can be recognised.
+    """A video whose images have all faces hidden.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ def ensure_detections(
     take: Take, *, people: int | None = None, masks: bool | None = None, force: bool = False,
     progress: Step | None = None, tell: Tell = warn,
 ) -> dict[str, Path]:
-    """Files of detections of all cameras of a take in which somebody is seen; made where they are not there yet.
+    """Detection files of all cameras of a take that show a person; missing ones are computed.
 
     With points of hands where the take's body has fingers, of faces where it has those or the take names them.
 
@@ -109,7 +109,7 @@ def _with_file(entry: KeypointsEntry, take: Take) -> KeypointsEntry:
 
 
 def somebody(jobs: Sequence[DetectionJob], tell: Tell = warn) -> dict[str, Path]:
-    """Files of the cameras that see somebody; a note about the others. ObservationError where there is no other."""
+    """Files of the cameras that show a person; a note names the others. ObservationError if no camera does."""
     empty = {job.camera: len(found) for job in jobs if not (found := read_detections(job.file)).seen.any()}
     remedy = "It needs at least half a body in view, taller than a tenth of the image, and enough light."
     if len(empty) == len(jobs):

@@ -112,7 +112,7 @@ def test_pairs_are_the_nearest_that_look_the_same_way(both):
 
 def test_rows_by_rays_and_by_pixels_tell_of_one_distance():
     body = load_body("humanoid")
-    state, view = body.usual_state(), camera().with_pose(
+    state, view = body.default_state(), camera().with_pose(
         np.array([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3.0], [0, 0, 0, 1]])
     )
     mesh = body_mesh(body)

@@ -174,13 +174,13 @@ def test_crossing_axes_part_along_their_perpendicular():
 @pytest.mark.parametrize("name", ["humanoid", "humanoid10"])
 def test_a_body_at_rest_and_in_usual_posture_does_not_collide(name):
     body = load_body(name)
-    for state in (body.usual_state(), body.rest_state()):
+    for state in (body.default_state(), body.rest_state()):
         assert len(collision_rows(body, state)) == 0
 
 
 def test_an_arm_in_the_trunk_is_pushed_out_and_then_left_alone():
     body = load_body("humanoid")
-    angles = np.array(body.usual_state().angles)
+    angles = np.array(body.default_state().angles)
     angles[body.tree.coordinate("arm_add_r")] = np.radians(25.0)
     state = BodyState(np.eye(4), angles)
     first = collision_rows(body, state)
@@ -216,12 +216,12 @@ def test_pairs_may_be_named():
     with pytest.raises(BodyError, match="no surface of thorax"):
         collision_pairs(bare, [("forearm_r", "thorax")])
     with pytest.raises(ObservationError, match="deviation"):
-        collision_rows(body, body.usual_state(), sigma=0.0)
+        collision_rows(body, body.default_state(), sigma=0.0)
 
 
 def test_a_body_without_surfaces_does_not_collide():
     body = random_body(1)
-    assert len(collision_rows(body, body.usual_state())) == 0
+    assert len(collision_rows(body, body.default_state())) == 0
 
 
 def test_several_surfaces_of_one_segment_do_not_push_each_other():

@@ -30,7 +30,7 @@ def played(scene, collected):
 
 
 def at(server):
-    """Of poses and wishes, with the token."""
+    """Of poses and requests, with the token."""
     return server.url.replace("http", "ws", 1)
 
 
@@ -69,14 +69,14 @@ def test_a_slow_client_misses_poses_and_the_others_miss_none(served, played):
 
 def test_wishes_are_passed_on_and_answered(scene, played):
     asked = queue.Queue()
-    server = WebSockets(0, ask=lambda *wish: asked.put(wish))
+    server = WebSockets(0, ask=lambda *request: asked.put(request))
     try:
         server.hello(scene.motion.body, played.hellos[0])
         with connect(at(server)) as client:
             client.recv(5.0)
             client.send('{"stop": true}')
-            wish, answer = asked.get(timeout=5.0)
-            assert wish == b'{"stop": true}'
+            request, answer = asked.get(timeout=5.0)
+            assert request == b'{"stop": true}'
             answer({"type": "done"})
             assert json.loads(client.recv(5.0)) == {"type": "done"}
     finally:
@@ -85,7 +85,7 @@ def test_wishes_are_passed_on_and_answered(scene, played):
 
 
 def test_without_the_token_poses_are_read_and_no_wish_is_heard(scene, played):
-    server = WebSockets(0, ask=lambda *wish: pytest.fail(f"{wish} was heard"))
+    server = WebSockets(0, ask=lambda *request: pytest.fail(f"{request} was heard"))
     try:
         server.hello(scene.motion.body, played.hellos[0])
         with connect(f"ws://127.0.0.1:{server.port}") as client:
@@ -137,7 +137,7 @@ def test_who_floods_a_session_is_cut_off_and_others_get_every_pose(scene, collec
 
 def test_answers_that_nobody_reads_end_the_connection(scene, played):
     """A client that takes nothing in: what waits for it does not grow for ever."""
-    server = WebSockets(0, ask=lambda wish, answer: [answer({"fill": "x" * 100_000}) for _ in range(300)])
+    server = WebSockets(0, ask=lambda request, answer: [answer({"fill": "x" * 100_000}) for _ in range(300)])
     try:
         server.hello(scene.motion.body, played.hellos[0])
         with connect(at(server), max_queue=1) as client:

@@ -124,7 +124,7 @@ def _skin(body: Body, balls: dict[int, Metaballs], first: int) -> BodySkin:
 
 def _separated_pose(body: Body, balls: dict[int, Metaballs], first: int) -> BodyState:
     """The rest pose with branching limbs separated: at the middle of their joints' limits about the forward axis."""
-    tree, state = body.tree, body.usual_state()
+    tree, state = body.tree, body.default_state()
     angles = np.zeros_like(state.angles)
     several = {s for s in balls if sum(int(tree.parents[c]) == s for c in balls) > 1}
     for s in balls:

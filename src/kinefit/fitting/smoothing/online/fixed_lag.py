@@ -181,7 +181,7 @@ class FixedLag:
         roots, angles = self._states()
         costs = Linearised(H, g, cost, roots, angles, (), np.zeros(len(cost)))
         lower, upper, mean = boxes(tree, angles)
-        prior = replace(self._prior, mean=mean, liveliness=self._livelier)
+        prior = replace(self._prior, mean=mean, activity=self._livelier)
         self._last: Smoothed = smooth(
             self.body, roots, angles, costs.equations, prior, bounds=(lower, upper), dense=True,
             entering=self._entering, max_iterations=_MAX_ITERATIONS, tolerance=1e-4,
@@ -199,7 +199,7 @@ class FixedLag:
         g[6:] += weight @ (mean[0] - angles[0])
         at_limit = (angles[0] <= lower[0]) | (angles[0] >= upper[0])
         held = np.concatenate([np.full(6, not self.body.tree.root_free), at_limit])
-        motion = replace(self._prior, liveliness=self._livelier).rows(3)
+        motion = replace(self._prior, activity=self._livelier).rows(3)
         share = block_diagonal(np.zeros((6, 6)), self._share - weight)
         self._entering = leave(self.body, (roots, angles), H, g, share, held, motion, self._entering)
         del self._frames[0]

@@ -1,8 +1,7 @@
-"""What a run leaves that is killed, so that the next one goes on where it ended, to the same result bit for bit.
+"""Checkpoints of a run: after a crash the next run resumes from the last one, to the same result bit for bit.
 
-A folder holds a `FrameFile`, a table of the frames done for whoever wants to look, and a lock. What is written is read
-back at once and gone on with, so that a run that was stopped goes through the same numbers as one that was not. Nothing
-that is read is run.
+A folder holds a `FrameFile`, a table of the finished frames for users, and a lock. What is written is read back at
+once and used, so an interrupted run computes with the same numbers as an uninterrupted one. Nothing is executed.
 """
 
 from __future__ import annotations
@@ -127,7 +126,7 @@ class Checkpoint:
                 raise ExportError("another run uses this folder", file=self.folder, remedy=remedy) from error
 
     def said(self) -> list[str]:
-        """Sentences for the user: what is gone on with, what is dropped and computed again, what is left alone."""
+        """Sentences for the user: what is resumed, what is computed again, what is left as it is."""
         out, problem, file = [], self.frames.problem, self.folder / _FRAMES
         if self.resumed:
             left = f"the run in {self.folder} at frame {self._found}"
@@ -141,7 +140,7 @@ class Checkpoint:
         return out
 
     def close(self) -> None:
-        """Let others in."""
+        """Release the lock."""
         for file in (self._frames, self._lock):
             if file is not None:
                 with suppress(OSError):  # of a full disk, which was reported before
@@ -153,7 +152,7 @@ class Checkpoint:
         self._remove_rows()
 
     def _remove_rows(self) -> None:
-        """Remove the table; ExportError where a file of its name is none."""
+        """Remove the table; ExportError if its name is not a file."""
         if not self.rows.exists():
             return
         with open(self.rows, "rb") as file:
@@ -188,7 +187,7 @@ def _record_classes(kinds: Iterable[SensorKind]) -> list[type]:
 
 
 def key_of(take: Take, **options: Any) -> str:
-    """Digest of a take, of its files as far as size and time of change tell, of options and of kinefit's own code."""
+    """Digest of a take, of sizes and modification times of its files, of options and of kinefit's own code."""
     digest = hashlib.sha256(repr((take, sorted(options.items()), np.__version__)).encode())
     digest.update(code_digest())
     for plugin in plugins_of(take):
@@ -227,7 +226,7 @@ def _paths(thing: Any) -> set[Path]:
 
 
 class TrackingInterrupted(KeyboardInterrupt):
-    """Ctrl-C while frames were being tracked; what is done is kept.
+    """Ctrl-C while frames were tracked; finished frames are kept.
 
     Parameters
     ----------

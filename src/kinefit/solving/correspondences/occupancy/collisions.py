@@ -104,7 +104,7 @@ def collision_pairs(body: Body, between: Sequence[tuple[str, str]] | None = None
         keep = np.array([frozenset(p) in wanted for p in pairs], bool) & (first != second)
     index = np.ascontiguousarray(index[keep], np.int64)
     apart = radius[index].sum(axis=1)
-    for state in (body.usual_state(), body.rest_state()):
+    for state in (body.default_state(), body.rest_state()):
         apart = np.minimum(apart, _gaps(body, state, segment, starts, ends, index)[3])
     return CollisionPairs(segment, starts, ends, radius, index, apart)
 

@@ -6,7 +6,7 @@
   let body = null, socket = null, paused = false, counted = [0, 0], rate = "–", drawn = 0;
 
   const make = (tag, parent, fields = {}) => parent.appendChild(Object.assign(document.createElement(tag), fields));
-  const ask = wish => socket.send(JSON.stringify(wish));
+  const ask = request => socket.send(JSON.stringify(request));
   const controls = make("p", panel);
   const pause = make("button", controls, { textContent: "Pause", onclick: () => ask({ pause: !paused }) });
   const stop = make("button", controls, { textContent: "End", onclick: () => {

@@ -64,7 +64,7 @@ class WebSockets(PageServer):
     host : "127.0.0.1" or "0.0.0.0" for all networks
     token : of the address, see `serving.access.Access`; None for a random one
     title : of the page
-    ask : callback for a client's wish (JSON) and its answer; None rejects all wishes
+    ask : callback for a client's request (JSON) and its answer; None rejects all requests
 
     Raises
     ------
@@ -111,7 +111,7 @@ class WebSockets(PageServer):
             client.news.set()
 
     async def talk(self, connection: Connection) -> None:
-        """Send packets and receive wishes until the client disconnects."""
+        """Send packets and receive requests until the client disconnects."""
         client = _Client()
         if self._hello is not None:
             client.hello = self._hello
@@ -125,7 +125,7 @@ class WebSockets(PageServer):
             sending.cancel()
 
     async def _listen(self, connection: Connection, client: _Client) -> None:
-        """Pass a client's wishes on; reject those that are not allowed."""
+        """Pass a client's requests on; reject those that are not allowed."""
 
         def answer(content: Mapping[str, Any]) -> None:  # from any thread
             self.call(back, msgspec.json.encode(content))
@@ -138,14 +138,14 @@ class WebSockets(PageServer):
                 client.news.set()
 
         while True:
-            wish = await connection.recv(decode=False)
+            request = await connection.recv(decode=False)
             if not connection.has_token:
                 why = "Requests need the token: connect to the address that kinefit printed, with ws instead of http."
                 answer({"type": "refused", "why": why})
             elif self._ask is None:
                 answer({"type": "refused", "why": "This session accepts no requests."})
             else:
-                self._ask(wish, answer)
+                self._ask(request, answer)
 
 
 async def _send(connection: Connection, client: _Client) -> None:
