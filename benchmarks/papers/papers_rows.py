@@ -2,8 +2,8 @@
 
 A page a paper has a heading a row. The parts of benchmarks that a row names run in their quick form; a row that names
 none is tried by its tests. The quick form of this area runs neither, as the other areas and the tests do: it checks
-that all that the pages name is there. `fill` writes the values of the pages' tables, and the index docs/papers.md, as the
-log has them.
+that all that the pages name is there. `fill` writes the values of the pages' tables and the index docs/papers.md, as
+the log has them.
 """
 
 from __future__ import annotations

@@ -57,4 +57,4 @@ def test_a_row_names_its_way_its_misses_and_its_figures():
     assert (row.title, row.way, row.source) == ("A title", "`kinefit x --a`", "real")
     assert row.misses and row.figures == ("f",)
     assert row.tests == ("tests/a/test_b.py", "tests/a/test_c.py")
-    assert papers.Row.commands.fget(row)[0][0] == "pytest"
+    assert row.commands[0][0] == "pytest"
