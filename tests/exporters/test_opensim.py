@@ -82,7 +82,7 @@ def test_limits_masses_and_bodies_are_usable(tmp_path):
 def test_inertia_is_that_of_a_round_rod(end):
     from kinefit.bodies import TaperedCylinder
 
-    mass, centre, inertia = mass_properties("thing", [TaperedCylinder.round(0, end, (0.05, 0.05))])
+    mass, centre, inertia = mass_properties([TaperedCylinder.round(0, end, (0.05, 0.05))])
     length = np.linalg.norm(end)
     assert mass == pytest.approx(1000 * np.pi * 0.05**2 * length)
     u = np.array(end) / length

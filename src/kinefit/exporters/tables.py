@@ -2,7 +2,7 @@
 
     angles      one row a frame: every coordinate [deg] (sliding ones [m]) with its standard deviation; the root as
                 place [m] and unit quaternion in the world, its deviations along [m] and about [deg] the world's axes
-    joints      joint centres [m] with standard deviations along the world's axes
+    joints      joint centres and centre of mass (com) [m] with standard deviations along the world's axes
     landmarks   landmarks [m]
     quality     of the frame and of every segment, 0..1
     residuals   long form, one row a sensor, frame and point that was seen: measured, measured minus fitted, weight; of

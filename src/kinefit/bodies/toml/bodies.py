@@ -33,6 +33,7 @@ from kinefit.bodies.toml.records import (
     direction,
     extended,
     left,
+    mass_of,
     merged,
     mirrored,
     refuse_repeated,
@@ -124,6 +125,7 @@ def _body(record: FileRecord, source: str) -> Body:
             for c in dict.fromkeys(c for s in segments for c in s.names)
         },
         stature=stature_of(record.body.stature or 0.0),
+        mass=mass_of(record.body.mass or 0.0),
         skin=skin_of(record.skin, tree, source),
         morphs=morphs_of(morph, tree, source),
     )  # fmt: skip

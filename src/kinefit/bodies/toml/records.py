@@ -98,6 +98,7 @@ class HeadRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     name: str
     base: str | None = None
     stature: float | None = None
+    mass: float | None = None
     mirror: bool | None = None
 
 
@@ -114,6 +115,20 @@ def stature_of(value: float) -> float:
     return value
 
 
+def mass_of(value: float) -> float:
+    """Check a mass [kg] as stated in a file; 0 if not stated.
+
+    Raises
+    ------
+    BodyError
+        A number that is no mass.
+    """
+    if not 0 <= value <= _HEAVIEST:
+        raise BodyError(f"a mass of {value:g} kg", place="body.mass", remedy="Give kilograms.")
+    return value
+
+
+_HEAVIEST = 1e5  # [kg]: of machines, too
 _TALLEST = 100.0  # [m]: of machines, too
 
 
