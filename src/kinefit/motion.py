@@ -233,9 +233,12 @@ class Motion:
     def parts(self, frames: int = _FRAMES_PER_BLOCK) -> Iterator[Motion]:
         """Its stretches of so many frames, without residuals: what is computed of one takes little memory."""
         for start in range(0, max(len(self), 1), frames):
-            arrays = {name: getattr(self, name)[start : start + frames] for name in ARRAYS}
-            lasting = self.lasting and self.lasting.part(slice(start, start + frames))
-            yield replace(self, residuals={}, lasting=lasting, **arrays)
+            yield self.part(slice(start, start + frames))
+
+    def part(self, frames: slice) -> Motion:
+        """A stretch of its frames, without residuals."""
+        arrays = {name: getattr(self, name)[frames] for name in ARRAYS}
+        return replace(self, residuals={}, lasting=self.lasting and self.lasting.part(frames), **arrays)
 
     def frame_at(self, time: float) -> int | None:
         """Frame nearest to a time [s], None where there is none within one frame."""

@@ -68,7 +68,7 @@ def segment_masses(body: Body, table: str = DE_LEVA) -> SegmentMasses:
     whole, std = (body.mass, 0.0) if body.mass else _mass_of(body.stature)
     total = float(shares.sum())
     masses = whole * (shares / total if total > _MIN_WHOLE_SHARE else shares)
-    return SegmentMasses(*_with_parts(body, masses, centres, known, volumes), std)
+    return SegmentMasses(*_with_parts(body, masses, centres, known, volumes), std * float(masses.sum()) / whole)
 
 
 def _mass_of(stature: float) -> tuple[float, float]:
