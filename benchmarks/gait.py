@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from benchmarks.figures import run_parts
 
-PARTS = {"gait_events": "contacts, toe-offs and steps of laboratory files, against plates and their own events"}
+PARTS = {
+    "gait_events": "contacts, toe-offs and steps of laboratory files, against plates and their own events",
+    "gait_record": "records of laboratory files by the command",
+    "gait_mass": "centre of mass of laboratory files, against the double integral of plates' forces",
+}
 
 if __name__ == "__main__":
     run_parts(PARTS)

@@ -17,12 +17,13 @@ from kinefit.bodies.surfaces import Surface, TaperedCylinder
 from kinefit.errors import BodyError, check_choice
 
 DE_LEVA, TABLES = "de_leva", ("de_leva", "de_leva_women", "de_leva_men", "dempster")
-"""The default, which is the mean of women and men, and all tables: de Leva 1996, and Dempster 1955 as in Winter 2009."""
+"""The default, which is the mean of women and men; all tables: de Leva 1996, and Dempster 1955 as in Winter 2009."""
 
 _FILE = Path(__file__).parents[1] / "data" / "segment_masses.toml"
 _BODY_MASS_INDEX = (1.2, 1.6), (15.5, 24.5)  # [m], [kg/m²]: children's medians at 1.2 m (WHO 2007), adults' world mean
 _INDEX_SPREAD = 0.17  # relative standard deviation of the index among adults, about that of ANSUR II (2014)
 _PERSON_KG = 75.0  # of a body without a stature
+_MAX_LENGTH_DIFFERENCE = 0.2  # relative, of a cylinder and its bone; of more it is no cylinder of the generic body
 _DENSITY_KG_M3 = 1000.0  # of gear and machines: water
 _MIN_WHOLE_SHARE = 0.5  # of the shares of a body that is a whole person, whose masses add up to the person's
 
@@ -83,7 +84,7 @@ def _shares(body: Body, table: str) -> tuple[NDArray, NDArray, NDArray]:
     tall = body.stature / generic.stature if body.stature else 1.0
     size = len(body.tree.segments)
     shares, centres, known = np.zeros(size), _middles(body), np.zeros(size, bool)
-    ends, usual = body.segment_ends(), generic.segment_ends()
+    lengths, usual = body.segment_lengths(), generic.segment_lengths()
     for s, name in enumerate(body.tree.segments):
         stem, side = re.fullmatch(r"(.*?)(_[lr])?", name).groups("")  # type: ignore[union-attr]
         if stem not in rows or body.gear_scale[body.segment_scale[s]]:
@@ -93,10 +94,10 @@ def _shares(body: Body, table: str) -> tuple[NDArray, NDArray, NDArray]:
         first, last = (_point(body, s, name, side) for name in points)
         if first is not None and last is not None:
             centres[s] = _on_axis(body, s, first, last, 0.01 * way)
-        same = generic.tree.segments.index(name) if name in generic.tree.segments else -1
-        if s in ends and same in usual:
-            longer = float(np.linalg.norm(ends[s]) / np.linalg.norm(usual[same])) / tall
-            shares[s] *= longer * _thicker(body, s, generic, same, longer * tall)
+        bones = [key for key in lengths.keys() & usual.keys() if key.startswith(f"{name}-")]
+        if bones:
+            longer = float(np.mean([lengths[key] / usual[key] for key in bones]))
+            shares[s] *= longer / tall * _thicker(body, s, generic, generic.tree.segments.index(name), longer)
     return shares, centres, known
 
 
@@ -137,11 +138,13 @@ def _on_axis(body: Body, segment: int, first: NDArray, last: NDArray, share: flo
 
 
 def _thicker(body: Body, segment: int, generic: Body, same: int, longer: float) -> float:
-    """How much larger the sections are than those of the generic body at this length; 1 but for cylinders."""
+    """How much larger the sections are than those of the generic body at this length; 1 but for its own cylinders."""
     of = [[c for c in b.surfaces if c.segment == s] for b, s in ((body, segment), (generic, same))]
     if len(of[0]) != len(of[1]) or not all(isinstance(c, TaperedCylinder) for c in (*of[0], *of[1])):
         return 1.0
-    return _volume(of[0]) / _volume(of[1]) / longer**3
+    a, b = (sum(float(rod(c)[2]) for c in surfaces) for surfaces in of)
+    alike = abs(np.log(a / b / longer)) < _MAX_LENGTH_DIFFERENCE
+    return _volume(of[0]) / _volume(of[1]) * b / a / longer**2 if alike else 1.0
 
 
 def _with_parts(

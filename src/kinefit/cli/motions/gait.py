@@ -12,7 +12,10 @@ from kinefit.cli import _screen
 if TYPE_CHECKING:
     from kinefit.exporters.gait.record import GaitRecord
 
-_ENDINGS = {"csv": "all strides and steps", "parquet": "the same", "json": "means, symmetry, variability", "page": "both sides on one page"}
+_CONTENTS = {
+    "csv": "all strides and steps", "parquet": "the same", "json": "means, symmetry, variability",
+    "page": "both sides on one page",
+}  # fmt: skip
 
 
 @click.command(short_help="Strides, steps and symmetry of a person's walks.", epilog="""\b
@@ -56,7 +59,7 @@ def gait(motions: tuple[Path, ...], out: Path | None, report: bool, reference: P
         return
     _print(record)
     for name, path in written.items():
-        _screen.say(f"{path}: {_ENDINGS[name]}")
+        _screen.say(f"{path}: {_CONTENTS[name]}")
 
 
 def _name(file: Path, files: list[Path]) -> str:
@@ -68,6 +71,8 @@ def _name(file: Path, files: list[Path]) -> str:
 
 def _print(record: GaitRecord) -> None:
     """Print the notes and a table of the record's walk."""
+    import numpy as np
+
     from kinefit.exporters.gait.files import is_symmetric
     from kinefit.exporters.gait.record import SIDES, symmetry
     from kinefit.exporters.report.report import value_and_error
@@ -78,12 +83,13 @@ def _print(record: GaitRecord) -> None:
     of = {side: record.quantities(side, walk) for side in (*SIDES, "both")}
     rows = []
     for name in of["both"]:
+        sides = [of[side][name] for side in SIDES if name in of[side]]
         row = [name]
         for side in SIDES:
-            row += [value_and_error(of[side][name], 1.0), f"{len(of[side][name].values)}"] if name in of[side] else ["–", "0"]
-        both = is_symmetric(name) and all(name in of[side] for side in SIDES)
-        value, std = symmetry(*(of[side][name] for side in SIDES)) if both else (0.0, 0.0)
-        rows.append([*row, f"{value:+.0f} ± {std:.0f}" if both else ""])
+            found = of[side].get(name)
+            row += [value_and_error(found, 1.0), f"{len(found.values)}"] if found else ["–", "0"]
+        value, std = symmetry(*sides) if len(sides) == 2 and is_symmetric(name) else (np.nan, np.nan)
+        rows.append([*row, f"{value:+.0f} ± {std:.0f}" if np.isfinite(value) else ""])
     turned = sum(one.walk != walk for one in record.stretches)
     _screen.print_table((f"{walk}, mean ± σ", "left", "n", "right", "n", "L−R [%]"), rows)
     if turned:

@@ -50,7 +50,8 @@ def write_gait(record: GaitRecord, folder: str | PathLike[str]) -> dict[str, Pat
 def stride_table(record: GaitRecord) -> Table:
     """Columns (rows,): trial, kind, side, walk, start and stop [s], each quantity with its standard deviation."""
     rows = record.stretches
-    out: Table = {name: np.array([getattr(one, name) for one in rows], np.str_) for name in ("trial", "kind", "side", "walk")}
+    texts = ("trial", "kind", "side", "walk")
+    out: Table = {name: np.array([getattr(one, name) for one in rows], np.str_) for name in texts}
     out |= {f"{name} [s]": np.array([getattr(one, name) for one in rows]) for name in ("start", "stop")}
     for name in QUANTITIES:
         stem, unit = name.split(" [")
@@ -95,7 +96,8 @@ def is_symmetric(name: str) -> bool:
 
 
 def _entry(of: Quantity) -> dict[str, Any]:
-    numbers = {"mean": of.mean, "std": of.std, "sd": of.spread, "cv_percent": 100.0 * of.spread / abs(of.mean or np.nan)}
+    variation = 100.0 * of.spread / abs(of.mean or np.nan)
+    numbers = {"mean": of.mean, "std": of.std, "sd": of.spread, "cv_percent": variation}
     return {name: _rounded(value) for name, value in numbers.items()} | {"n": len(of.values)}
 
 

@@ -22,13 +22,13 @@ from kinefit.findings import listed
 _SHOWN = ("Pelvis", "Hip", "Knee", "Ankle")  # joints whose curves stand open
 
 _DEFINITIONS = (
-    "A stride lasts from one contact of a foot to its next. Stance lasts from contact to toe-off; it and double support "
-    "are per cent of the stride.",
+    "A stride lasts from one contact of a foot to its next. Stance lasts from contact to toe-off. It and double "
+    "support are per cent of the stride.",
     "A step is named after the foot that lands. Its length is along the stride, between heels that stand; its width is "
     "the other heel's distance from the stride.",
     "Foot progression is positive with the toes out.",
     "A walk is straight where the pelvis turns by less than 20° from contact to contact.",
-    "Symmetry is left minus right, in per cent of the mean of both.",
+    "Left minus right stands beside its share of the mean of both sides, which is zero of a symmetric walk.",
     "± is two standard deviations of the mean's error. SD is the standard deviation of single strides and steps.",
 )  # fmt: skip
 
@@ -58,30 +58,34 @@ def write_gait_page(
     facts = {SESSION.get(key, key): str(value) for key, value in session.items() if value and key in SESSION}
     if motion.body.stature:
         facts["Stature"] = f"{motion.body.stature:.2f} m"
-    facts["Walks"] = listed([walk.name for walk in record.walks], 8)
+    walked = listed([walk.name for walk in record.walks], 8)
+    subject = session.get("subject") or motion.name
     sections = [
         p.section("Gait", p.facts(facts), *(p.callout("note", note) for note in record.notes), *_numbers(record)),
         p.section("Curves over the cycle", *_curves(record, norms)),
         p.section("How it is measured", p.bullets(_DEFINITIONS)),
     ]
-    write_text(path, p.page(f"Gait of {motion.name}", sections, subtitle=f"Gait record, {date}."))
+    write_text(path, p.page(f"Gait record of {subject}", sections, subtitle=f"{date}. {walked}."))
     return Path(path)
 
 
 def _numbers(record: GaitRecord) -> list[p.Html]:
     """A table of the record's walk."""
     of = {side: record.quantities(side, record.walk) for side in (*SIDES, "both")}
-    columns = ["", *(head for side in SIDES for head in (f"{side}, mean ± 2 σ", "SD", "n")), "left − right", "symmetry"]
+    heads = [head for side in SIDES for head in (f"{side}, mean ± 2 σ", "SD", "n")]
+    columns = ["", *heads, "left − right", "of the mean"]
     rows = []
     for name in of["both"]:
         row = [name]
         for side in SIDES:
-            row += [*cells(of[side][name]), f"{len(of[side][name].values)}"] if name in of[side] else ["–", "–", "0"]
+            found = of[side].get(name)
+            row += [*cells(found), f"{len(found.values)}"] if found else ["–", "–", "0"]
         rows.append([*row, *_difference(name, *(of[side].get(name) for side in SIDES))])
     counts = listed([f"{record.count('stride', side, record.walk)} {side}" for side in SIDES])
     steps = sum(record.count("step", side, record.walk) for side in SIDES)
     turned = sum(one.walk != record.walk for one in record.stretches)
-    text = f"Strides: {counts}, and {steps} single steps, walking {'straight' if record.walk == 'straight' else 'a turn'}."
+    how = "straight" if record.walk == "straight" else "in a turn"
+    text = f"Strides: {counts}, and {steps} single steps, walking {how}."
     more = f" {turned} strides and steps in turns are in the tables alone." if turned else ""
     return [p.paragraph(text + more), p.table(columns, rows)]
 
@@ -104,9 +108,9 @@ def _curves(record: GaitRecord, norms: Norms | None) -> list[p.Html]:
         return [p.callout("note", "No stride: curves need two contacts of one foot.")]
     plots = cycle_plots(trials, norms)
     text = (
-        "From contact to contact of a foot (0–100 %). The thick line is the mean, thin ones are single strides; the band "
-        "is ±1 standard deviation between strides, if there are three or more. The dashed vertical line is toe-off. "
-        "Rotation of the pelvis is relative to its mean heading."
+        "From contact to contact of a foot (0–100 %). The thick line is the mean, thin ones are single strides. The "
+        "band is ±1 standard deviation between strides, if there are three or more. The dashed vertical line is "
+        "toe-off. Rotation of the pelvis is relative to its mean heading."
     )
     parts = [p.paragraph(text)]
     if norms:

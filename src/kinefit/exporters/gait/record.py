@@ -15,6 +15,7 @@ from kinefit.exporters.report.cycles import Cycles, find_gait, take_turns
 from kinefit.exporters.report.feet import HEEL, MIN_STRIDE_S, Feet, foot_events
 from kinefit.exporters.report.strides import QUANTITIES, Quantity, step_quantities, stride_quantities
 from kinefit.findings import listed
+from kinefit.lasting_errors import differ
 from kinefit.motion import Motion, rotation_between_up
 
 SIDES, WALKS = ("left", "right"), ("straight", "turning")
@@ -115,7 +116,7 @@ def gait_record(motions: Mapping[str, Motion]) -> GaitRecord:
     ObservationError
         None of the motions has a stride or step, or they are of different people.
     """
-    _check_one_person(motions)
+    doubts = _check_one_person(motions)
     walks, faults = [], dict[str, str]()
     for name, motion in motions.items():
         found = _walk(name, motion)
@@ -129,7 +130,8 @@ def gait_record(motions: Mapping[str, Motion]) -> GaitRecord:
         raise ObservationError(problem, file=listed(motions), remedy=remedy)
     left_out = [f"{name} is left out: {fault}." for name, fault in faults.items()]
     notes = [f"{walk.name}: {note}" for walk in walks for note in walk.notes]
-    return GaitRecord(tuple(walks), tuple(one for walk in walks for one in _stretches(walk)), (*left_out, *notes))
+    stretches = tuple(one for walk in walks for one in _stretches(walk))
+    return GaitRecord(tuple(walks), stretches, (*doubts, *left_out, *notes))
 
 
 def symmetry(left: Quantity, right: Quantity) -> tuple[float, float]:
@@ -189,7 +191,8 @@ def _posture_fault(motion: Motion) -> str:
     height = float(np.median(heights[:, :, 0].mean(axis=1) - heights[:, :, 1].min(axis=1)))
     share = height / (motion.body.stature or 1.7)
     if share < _MIN_UPRIGHT:
-        return f"the hips are {height:.2f} m above the heels along {motion.up}: the person lies, or {motion.up} is not up"
+        above = f"the hips are {height:.2f} m above the heels along {motion.up}"
+        return f"{above}: the person lies, or {motion.up} is not up"
     return f"the person sits: the hips are {height:.2f} m above the heels" if share < _MIN_STANDING else ""
 
 
@@ -202,7 +205,7 @@ def _no_step(feet: Feet) -> str:
 
 
 def _single_steps(feet: Feet, strides: Mapping[str, NDArray]) -> list[tuple[str, float, float]]:
-    """(side, contact of the other foot, contact of this one) [s] of the steps that are in no stride (N, 2) of the side."""
+    """(side, contact of the other foot, contact of this one) [s] of steps that are in no stride (N, 2) of the side."""
     events = sorted([(float(t), side) for side, foot in zip(SIDES, (feet.left, feet.right)) for t in foot.contacts])
     out = []
     for (start, other), (stop, side) in pairwise(events):
@@ -254,20 +257,24 @@ def straight_cycles(record: GaitRecord) -> list[tuple[Motion, Cycles]]:
     return out
 
 
-def _check_one_person(motions: Mapping[str, Motion]) -> None:
-    """Raise ObservationError where motions are of people of other names, bodies or legs."""
+def _check_one_person(motions: Mapping[str, Motion]) -> list[str]:
+    """Sentences on motions that may be of other people; ObservationError where subjects or legs differ."""
     remedy = "Give the motions of one person at a time."
     people = {name: _subject(motion) for name, motion in motions.items()}
     named = {subject: name for name, subject in people.items() if subject}
     if len(named) > 1:
         each = listed([f"{subject} ({name})" for subject, name in named.items()])
         raise ObservationError(f"motions of {len(named)} people: {each}", file=next(iter(motions)), remedy=remedy)
-    first, *others = motions
+    doubts, (first, *others) = [], motions
     for other in others:
         apart = _leg_ratio(motions[first].body, motions[other].body)
         if apart > _MAX_LENGTH_RATIO:
             problem = f"two people: the legs in {first} and {other} differ by {100 * (apart - 1):.0f} % in length"
             raise ObservationError(problem, file=other, remedy=remedy)
+        one, two = motions[first].lasting, motions[other].lasting
+        if one is not None and two is not None and differ(one, two):
+            doubts.append(f"lengths in {other} differ from {first} by more than their error bars: one person?")
+    return doubts
 
 
 def _leg_ratio(one: Body, other: Body) -> float:

@@ -68,7 +68,8 @@ def cycle_plots(trials: Sequence[tuple[Motion, Cycles]], norms: Norms | None = N
     """
     sides = list(dict.fromkeys(side.name for _, cycles in trials for side in cycles.sides))
     other = sides[0]  # of the middle of the body: the cycles of this side
-    toe_off = {name: np.concatenate([s.toe_off for _, c in trials for s in c.sides if s.name == name]) for name in sides}
+    every_side = [side for _, cycles in trials for side in cycles.sides]
+    toe_off = {name: np.concatenate([s.toe_off for s in every_side if s.name == name]) for name in sides}
     marks = {name: float(np.nanmean(at)) for name, at in toe_off.items() if np.isfinite(at).any()}
     every = [({c.name: c for c in curves(motion)}, cycles) for motion, cycles in trials]
 

@@ -348,13 +348,15 @@ def cells(of: Quantity) -> tuple[str, str]:
 
 def value_and_error(of: Quantity, sigmas: float = 2.0) -> str:
     """The mean with so many standard deviations of its error."""
-    digits = _digits(of.mean)
-    return f"{of.mean:.{digits}f}" + (f" ± {sigmas * of.std:.{digits}f}" if np.isfinite(of.std) else ", not observed")
+    if not np.isfinite(of.std):
+        return f"{of.mean:.{_digits(of.mean)}f}, not observed"
+    digits = max(_digits(of.mean), _digits(sigmas * of.std, count=1))
+    return f"{of.mean:.{digits}f} ± {sigmas * of.std:.{digits}f}"
 
 
-def _digits(value: float) -> int:
-    """Digits behind the point, of three that count."""
-    return max(0, 2 - int(np.floor(np.log10(max(abs(value), 1e-9)))))
+def _digits(value: float, count: int = 3) -> int:
+    """Digits behind the point, of so many that count; six at most."""
+    return min(6, max(0, count - 1 - int(np.floor(np.log10(max(abs(value), 1e-9))))))
 
 
 def _fit(motion: Motion, moments: Sequence[Moment]) -> list[p.Html]:

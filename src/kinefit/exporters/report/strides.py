@@ -82,7 +82,7 @@ def _stride(
     """{name: (value, standard deviation)} of the stride between two contacts of a foot."""
     length = stop - start
     ends = [_std_at(own, t) for t in (start, stop)]
-    std = float(np.hypot(*ends))
+    std = float(np.hypot(ends[0], ends[1]))
     out = {"stride time [s]": (length, std), "cadence [steps/min]": (120.0 / length, 120.0 * std / length**2)}
     first = _within(own.offs, own.off_std, start, stop)
     landed = _within(other.contacts, other.contact_std, start, stop)
@@ -109,7 +109,7 @@ def step_quantities(motion: Motion, feet: Feet, side: str, start: float, stop: f
     Its length is along the way of the pelvis in this time.
     """
     own, other = (feet.left, feet.right) if side == "left" else (feet.right, feet.left)
-    std = float(np.hypot(*(_std_at(foot, time) for foot, time in ((other, start), (own, stop)))))
+    std = float(np.hypot(_std_at(other, start), _std_at(own, stop)))
     out = {"step time [s]": (stop - start, std)}
     ground, settled = _Ground(motion, feet.belt), _SETTLED * 2.0 * (stop - start)
     begin, end = (ground.frame(t + settled) for t in (start, stop))
