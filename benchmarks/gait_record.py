@@ -40,7 +40,8 @@ def run() -> None:
     share = 100.0 * sum(map(bool, strides.values())) / len(strides) if strides else None
     figure("gait_command_records", share, "% of files", ">= 100", reason)
     lacking = None if both is None else sum(strides[path.name] for path in pair) - both
-    figure("gait_command_lost", lacking, "strides of two walks together", "== 0", "" if lacking is not None else "one file")
+    missing = "" if lacking is not None else "one file alone"
+    figure("gait_command_lost", lacking, "strides of two walks together", "== 0", missing)
 
 
 def _strides(motions: list[Path]) -> int:

@@ -14,6 +14,7 @@ from tests.conftest import ROOT
 from tests.docs import drawn
 from tests.docs.blocks import blocks
 from tests.docs.world import world
+from tests.exporters.report.test_cycles import walk as walking
 
 from kinefit import Markers, learn_model
 from kinefit.bodies.marker_sets import placement
@@ -164,6 +165,13 @@ def which_setup(folder):
     yield
 
 
+def gait(folder):
+    for name in ("walk1", "walk2"):
+        write_motion(walking(), folder / "monday" / name / "motion.npz")
+    (folder / "adults.csv").write_text(blocks("gait", "text")[0].text)
+    yield
+
+
 def motion(folder):
     write_motion(world().motion, folder / "motion.npz")
     yield
@@ -192,6 +200,7 @@ def sapm(folder):
 PREPARED = {
     "README": nothing, "app": nothing, "batch": batch, "blender": blender, "calibration": calibration, "check": take,
     "closed-chains": nothing, "comparison": comparison, "detect": nothing, "first-recording": first_recording,
+    "gait": gait,
     "index": nothing, "init": init, "install": nothing, "live": take, "one-camera": nothing,
     "recipes/depth-fusion": depth_fusion, "recipes/silhouettes": nothing,
     "recipes/sapm": sapm, "regions": nothing, "sensors": walk, "simulate": simulate, "surfaces": surfaces,
