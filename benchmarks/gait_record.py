@@ -2,8 +2,8 @@
 
     python -m benchmarks.gait gait_record
 
-The files are those of `gait_events`, and walks of another laboratory (an adult, 100 Hz, with a static trial). In each
-a foot meets the ground twice.
+The files are those of `gait_events`, in each of which a foot meets the ground twice, and walks of another laboratory
+(an adult, 1.3 s at 100 Hz, with a static trial), in which each foot meets the ground once: half a cycle, a single step.
 """
 
 from __future__ import annotations
@@ -23,33 +23,34 @@ _WALKS = ("walking1", "walking2", "walkingTO1", "walkingTS1")
 
 
 def run() -> None:
-    """Print of how many files the command gives a record with strides, and whether two walks come together."""
+    """Print of how many files the command gives a record, and whether two walks come together."""
     files = [path for name in (*PRINTED, *CHOSEN) if (path := file_of(name)) is not None]
     folder = data("forces_nimblephysics")
     files += [] if folder is None else [folder / "subject4" / f"{name}.trc" for name in _WALKS]
-    strides = dict[str, int]()
+    found = dict[str, tuple[int, int]]()
     with tempfile.TemporaryDirectory() as out:
         for path in files[: amount(None, 1)]:
             name = f"{path.parent.name}-{path.stem}"
             write_motion(fitted(path), Path(out) / name / "motion.npz")
-            strides[name] = _strides([Path(out) / name])
-            print(f"# {name}: {strides[name]} strides")
+            found[name] = _counts([Path(out) / name])
+            print(f"# {name}: {found[name][0]} strides, {found[name][1]} single steps")
         pair = [Path(out) / name for name in ("HC030A-straight", "HC030A-turn")]
-        both = _strides(pair) if all(path.is_dir() for path in pair) else None
-    reason = "" if strides else "no recording"
-    share = 100.0 * sum(map(bool, strides.values())) / len(strides) if strides else None
+        both = _counts(pair) if all(path.is_dir() for path in pair) else None
+    reason = "" if found else "no recording"
+    share = 100.0 * sum(map(any, found.values())) / len(found) if found else None
     figure("gait_command_records", share, "% of files", ">= 100", reason)
-    lacking = None if both is None else sum(strides[path.name] for path in pair) - both
+    lacking = None if both is None else sum(sum(found[path.name]) for path in pair) - sum(both)
     missing = "" if lacking is not None else "one file alone"
-    figure("gait_command_lost", lacking, "strides of two walks together", "== 0", missing)
+    figure("gait_command_lost", lacking, "strides and steps of two walks together", "== 0", missing)
 
 
-def _strides(motions: list[Path]) -> int:
-    """Number of strides in the record of motions; 0 without a record."""
+def _counts(motions: list[Path]) -> tuple[int, int]:
+    """Numbers of strides and of single steps in the record of motions; none without a record."""
     command = [sys.executable, "-m", "kinefit", "gait", *map(str, motions), "--out", str(motions[0].parent / "gait")]
     done = subprocess.run([*command, "--json"], capture_output=True, text=True)
     if done.returncode:
         print(f"# {done.stderr.strip()}")
-        return 0
+        return 0, 0
     found: dict[str, Any] = json.loads(done.stdout)
-    return sum(sum(found[walk]["strides"].values()) for walk in ("straight", "turning"))
+    walks = [found[walk] for walk in ("straight", "turning")]
+    return sum(sum(of["strides"].values()) for of in walks), sum(sum(of["steps"].values()) for of in walks)

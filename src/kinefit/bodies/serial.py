@@ -57,7 +57,7 @@ from kinefit.bodies.closures import KINDS, Closure, Dimension
 from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph, Steering
 from kinefit.bodies.surfaces import MeshSurface, Metaballs, SkinnedMesh, Surface, TaperedCylinder
 from kinefit.bodies.toml.bodies import read_toml_body
-from kinefit.bodies.toml.records import mass_of, stature_of
+from kinefit.bodies.toml.records import size_of
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError
 
@@ -188,7 +188,7 @@ def body_from_arrays(arrays: Arrays) -> Body:
     points = lambda prefix: PointSet(**fields_of(arrays, _SHAPES["points"], sizes, prefix))
     aliases = {key: fields_of(arrays, {key: "n 2$"}, {})[key] for key in arrays if key.startswith("aliases/")}
     body = Body(
-        **own | {"stature": stature_of(own["stature"]), "mass": mass_of(own["mass"])},
+        **own | {key: size_of(key, own[key]) for key in ("stature", "mass")},
         tree=tree,
         landmarks=points("landmarks/"),
         keypoint_sets={name: points(prefix) for name, prefix in prefixes(arrays, "keypoints").items()},

@@ -15,7 +15,7 @@ deviation "inf" means that nothing observed it.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from os import PathLike
@@ -337,6 +337,17 @@ def _write(
             files.append(folder / f"{name}{suffix}")
             write(pieces, stack.enter_context(writing(files[-1])))
     return tuple(files)
+
+
+def quantity_table(rows: Sequence[Any], names: Iterable[str], quantities: Iterable[str]) -> Table:
+    """Columns of attributes, texts or times [s], and of `values` {quantity [unit]: (value, standard deviation)}."""
+    each = {name: [getattr(row, name) for row in rows] for name in names}
+    out: Table = {f"{n} [s]" if n in ("start", "stop") else n: np.array(of) for n, of in each.items()}
+    for name in quantities:
+        stem, unit = name.split(" [")
+        values, stds = np.array([row.values.get(name, (np.nan, np.nan)) for row in rows]).T
+        out |= {name: values, f"{stem} std [{unit}": stds}
+    return out
 
 
 def to_csv(pieces: Iterable[Table], file: Path) -> None:

@@ -33,11 +33,10 @@ from kinefit.bodies.toml.records import (
     direction,
     extended,
     left,
-    mass_of,
     merged,
     mirrored,
     refuse_repeated,
-    stature_of,
+    size_of,
     with_images,
 )
 from kinefit.bodies.tree import COLUMNS, KinematicTree
@@ -124,8 +123,8 @@ def _body(record: FileRecord, source: str) -> Body:
             c: {s.name: s.names[c] for s in segments if c in s.names}
             for c in dict.fromkeys(c for s in segments for c in s.names)
         },
-        stature=stature_of(record.body.stature or 0.0),
-        mass=mass_of(record.body.mass or 0.0),
+        stature=size_of("stature", record.body.stature or 0.0),
+        mass=size_of("mass", record.body.mass or 0.0),
         skin=skin_of(record.skin, tree, source),
         morphs=morphs_of(morph, tree, source),
     )  # fmt: skip

@@ -102,34 +102,21 @@ class HeadRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     mirror: bool | None = None
 
 
-def stature_of(value: float) -> float:
-    """Check a stature [m] as stated in a file; 0 if not stated.
+def size_of(key: str, value: float) -> float:
+    """Check a "stature" [m] or "mass" [kg] as stated in a file; 0 if not stated.
 
     Raises
     ------
     BodyError
-        A number that is no stature.
+        A number that is none.
     """
-    if not 0 <= value <= _TALLEST:
-        raise BodyError(f"a stature of {value:g} m", place="body.stature", remedy="Give metres.")
+    most, unit, units = _MOST[key]
+    if not 0 <= value <= most:
+        raise BodyError(f"a {key} of {value:g} {unit}", place=f"body.{key}", remedy=f"Give {units}.")
     return value
 
 
-def mass_of(value: float) -> float:
-    """Check a mass [kg] as stated in a file; 0 if not stated.
-
-    Raises
-    ------
-    BodyError
-        A number that is no mass.
-    """
-    if not 0 <= value <= _HEAVIEST:
-        raise BodyError(f"a mass of {value:g} kg", place="body.mass", remedy="Give kilograms.")
-    return value
-
-
-_HEAVIEST = 1e5  # [kg]: of machines, too
-_TALLEST = 100.0  # [m]: of machines, too
+_MOST = {"stature": (100.0, "m", "metres"), "mass": (1e5, "kg", "kilograms")}  # of machines, too
 
 
 class MarkerSetRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -71,25 +71,15 @@ def _name(file: Path, files: list[Path]) -> str:
 
 def _print(record: GaitRecord) -> None:
     """Print the notes and a table of the record's walk."""
-    import numpy as np
-
-    from kinefit.exporters.gait.files import is_symmetric
-    from kinefit.exporters.gait.record import SIDES, symmetry
     from kinefit.exporters.report.report import value_and_error
 
     for note in record.notes:
         _screen.note(note)
     walk = record.walk
-    of = {side: record.quantities(side, walk) for side in (*SIDES, "both")}
     rows = []
-    for name in of["both"]:
-        sides = [of[side][name] for side in SIDES if name in of[side]]
-        row = [name]
-        for side in SIDES:
-            found = of[side].get(name)
-            row += [value_and_error(found, 1.0), f"{len(found.values)}"] if found else ["–", "0"]
-        value, std = symmetry(*sides) if len(sides) == 2 and is_symmetric(name) else (np.nan, np.nan)
-        rows.append([*row, f"{value:+.0f} ± {std:.0f}" if np.isfinite(value) else ""])
+    for name, left, right, (share, std) in record.compared(walk):
+        each = [cell for found in (left, right) for cell in (value_and_error(found, 1.0), f"{len(found.values)}")]
+        rows.append([name, *each, f"{share:+.0f} ± {std:.0f}" if share == share else ""])
     turned = sum(one.walk != walk for one in record.stretches)
     _screen.print_table((f"{walk}, mean ± σ", "left", "n", "right", "n", "L−R [%]"), rows)
     if turned:

@@ -12,9 +12,9 @@ import numpy as np
 
 from kinefit._files import write_text, writing
 from kinefit.bodies.masses import segment_masses
-from kinefit.exporters.gait.record import SIDES, WALKS, GaitRecord, symmetry
+from kinefit.exporters.gait.record import SIDES, WALKS, GaitRecord
 from kinefit.exporters.report.strides import QUANTITIES, Quantity
-from kinefit.exporters.tables import Table, parquet_writer, to_csv
+from kinefit.exporters.tables import Table, parquet_writer, quantity_table, to_csv
 
 _DIGITS = 6  # that count, of numbers in the summary
 
@@ -49,15 +49,7 @@ def write_gait(record: GaitRecord, folder: str | PathLike[str]) -> dict[str, Pat
 
 def stride_table(record: GaitRecord) -> Table:
     """Columns (rows,): trial, kind, side, walk, start and stop [s], each quantity with its standard deviation."""
-    rows = record.stretches
-    texts = ("trial", "kind", "side", "walk")
-    out: Table = {name: np.array([getattr(one, name) for one in rows], np.str_) for name in texts}
-    out |= {f"{name} [s]": np.array([getattr(one, name) for one in rows]) for name in ("start", "stop")}
-    for name in QUANTITIES:
-        stem, unit = name.split(" [")
-        values, stds = np.array([one.values.get(name, (np.nan, np.nan)) for one in rows]).T
-        out |= {name: values, f"{stem} std [{unit}": stds}
-    return out
+    return quantity_table(record.stretches, ("trial", "kind", "side", "walk", "start", "stop"), QUANTITIES)
 
 
 def summary(record: GaitRecord) -> dict[str, Any]:
@@ -78,21 +70,14 @@ def summary(record: GaitRecord) -> dict[str, Any]:
     }  # fmt: skip
     for walk in WALKS:
         counts = {f"{kind}s": {side: record.count(kind, side, walk) for side in SIDES} for kind in ("stride", "step")}
-        of = {side: record.quantities(side, walk) for side in (*SIDES, "both")}
-        quantities = {}
-        for name in of["both"]:
-            entry = {side: _entry(found[name]) for side, found in of.items() if name in found}
-            if is_symmetric(name) and all(name in of[side] for side in SIDES):
-                value, std = symmetry(*(of[side][name] for side in SIDES))
-                entry["symmetry_percent"] = {"value": _rounded(value), "std": _rounded(std)}
+        both, quantities = record.quantities("both", walk), {}
+        for name, left, right, (share, std) in record.compared(walk):
+            entry = {side: _entry(q) for side, q in zip((*SIDES, "both"), (left, right, both[name])) if len(q.values)}
+            if np.isfinite(share):
+                entry["symmetry_percent"] = {"value": _rounded(share), "std": _rounded(std)}
             quantities[name] = entry
         out[walk] = {**counts, "quantities": quantities}
     return out
-
-
-def is_symmetric(name: str) -> bool:
-    """Whether the difference of the sides as a share of their mean says something: not of an angle about zero."""
-    return not name.endswith("[deg]")
 
 
 def _entry(of: Quantity) -> dict[str, Any]:

@@ -10,8 +10,7 @@ import numpy as np
 
 from kinefit._arguments import checked
 from kinefit._files import write_text
-from kinefit.exporters.gait.files import is_symmetric
-from kinefit.exporters.gait.record import SIDES, GaitRecord, straight_cycles, symmetry
+from kinefit.exporters.gait.record import SIDES, GaitRecord, straight_cycles
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.angles import cycle_plots
 from kinefit.exporters.report.cycles import Norms
@@ -71,16 +70,12 @@ def write_gait_page(
 
 def _numbers(record: GaitRecord) -> list[p.Html]:
     """A table of the record's walk."""
-    of = {side: record.quantities(side, record.walk) for side in (*SIDES, "both")}
     heads = [head for side in SIDES for head in (f"{side}, mean ± 2 σ", "SD", "n")]
     columns = ["", *heads, "left − right", "of the mean"]
     rows = []
-    for name in of["both"]:
-        row = [name]
-        for side in SIDES:
-            found = of[side].get(name)
-            row += [*cells(found), f"{len(found.values)}"] if found else ["–", "–", "0"]
-        rows.append([*row, *_difference(name, *(of[side].get(name) for side in SIDES))])
+    for name, left, right, share in record.compared(record.walk):
+        each = [cell for found in (left, right) for cell in (*cells(found), f"{len(found.values)}")]
+        rows.append([name, *each, *_difference(name, left, right, share)])
     counts = listed([f"{record.count('stride', side, record.walk)} {side}" for side in SIDES])
     steps = sum(record.count("step", side, record.walk) for side in SIDES)
     turned = sum(one.walk != record.walk for one in record.stretches)
@@ -90,14 +85,13 @@ def _numbers(record: GaitRecord) -> list[p.Html]:
     return [p.paragraph(text + more), p.table(columns, rows)]
 
 
-def _difference(name: str, left: Quantity | None, right: Quantity | None) -> tuple[str, str]:
+def _difference(name: str, left: Quantity, right: Quantity, share: tuple[float, float]) -> tuple[str, str]:
     """Left minus right, and that in per cent of their mean, each with two standard deviations."""
-    if left is None or right is None:
+    if not (np.isfinite(left.mean) and np.isfinite(right.mean)):
         return "–", "–"
     value, twice = left.mean - right.mean, 2.0 * float(np.hypot(left.std, right.std))
     digits = 3 if "[m]" in name or "[m/s]" in name or "[s]" in name else 1
-    share, error = symmetry(left, right)
-    percent = f"{share:+.1f} ± {2.0 * error:.1f} %" if is_symmetric(name) else "–"
+    percent = f"{share[0]:+.1f} ± {2.0 * share[1]:.1f} %" if np.isfinite(share[0]) else "–"
     return f"{value:+.{digits}f} ± {twice:.{digits}f}", percent
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -95,6 +95,16 @@ class GaitRecord:
             if len(pairs):
                 out[name] = Quantity(pairs[:, 0], pairs[:, 1])
         return out
+
+    def compared(self, walk: str) -> Iterator[tuple[str, Quantity, Quantity, tuple[float, float]]]:
+        """Each quantity: its name, of the left and of the right side, and their `symmetry`; NaN where there is none."""
+        left, right = (self.quantities(side, walk) for side in SIDES)
+        none = Quantity(np.zeros(0), np.zeros(0))
+        for name in QUANTITIES:
+            if name in left or name in right:
+                a, b = left.get(name, none), right.get(name, none)
+                share = (np.nan, np.nan) if name.endswith("[deg]") else symmetry(a, b)  # an angle may be about zero
+                yield name, a, b, share
 
     @property
     def walk(self) -> str:

@@ -341,13 +341,13 @@ def gait_table(motion: Motion, cycles: Cycles) -> p.Html:
 
 def cells(of: Quantity) -> tuple[str, str]:
     """The mean with two standard deviations of its error, and how much single cycles differ."""
-    if not np.isfinite(of.mean):
-        return "–", "–"
     return value_and_error(of), f"{of.spread:.{_digits(of.mean)}f}" if np.isfinite(of.spread) else "–"
 
 
 def value_and_error(of: Quantity, sigmas: float = 2.0) -> str:
     """The mean with so many standard deviations of its error."""
+    if not np.isfinite(of.mean):
+        return "–"
     if not np.isfinite(of.std):
         return f"{of.mean:.{_digits(of.mean)}f}, not observed"
     digits = max(_digits(of.mean), _digits(sigmas * of.std, count=1))
