@@ -168,6 +168,7 @@ def which_setup(folder):
 def gait(folder):
     for name in ("walk1", "walk2"):
         write_motion(walking(), folder / "monday" / name / "motion.npz")
+    write_motion(squat_and_wave(), folder / "squats" / "motion.npz")
     (folder / "adults.csv").write_text(blocks("gait", "text")[0].text)
     yield
 

@@ -153,9 +153,9 @@ def _with_parts(
     """Masses and centres where segments that the table lacks have their part of the next one inwards, by volumes."""
     tree, owner = body.tree, np.arange(len(masses))
     gear = body.gear_scale[body.segment_scale]
-    for s in range(len(masses)):
-        if not known[s]:
-            owner[s] = owner[tree.parents[s]] if s else 0
+    for part in range(len(masses)):
+        if not known[part]:
+            owner[part] = owner[tree.parents[part]] if part else 0
     out, at = masses.copy(), centres.copy()
     for s in np.flatnonzero(known):
         parts = np.flatnonzero((owner == s) & ~gear & (volumes > 0))

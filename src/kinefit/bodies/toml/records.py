@@ -110,13 +110,13 @@ def size_of(key: str, value: float) -> float:
     BodyError
         A number that is none.
     """
-    most, unit, units = _MOST[key]
+    most, unit, units = _MAX_SIZES[key]
     if not 0 <= value <= most:
         raise BodyError(f"a {key} of {value:g} {unit}", place=f"body.{key}", remedy=f"Give {units}.")
     return value
 
 
-_MOST = {"stature": (100.0, "m", "metres"), "mass": (1e5, "kg", "kilograms")}  # of machines, too
+_MAX_SIZES = {"stature": (100.0, "m", "metres"), "mass": (1e5, "kg", "kilograms")}  # of machines, too
 
 
 class MarkerSetRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -18,7 +18,7 @@ from kinefit.exporters.report.report import SESSION, cells, check_norms
 from kinefit.exporters.report.strides import Quantity
 from kinefit.findings import listed
 
-_SHOWN = ("Pelvis", "Hip", "Knee", "Ankle")  # joints whose curves stand open
+_OPEN_JOINTS = ("Pelvis", "Hip", "Knee", "Ankle")  # joints whose curves stand open
 
 _DEFINITIONS = (
     "A stride lasts from one contact of a foot to its next. Stance lasts from contact to toe-off. It and double "
@@ -109,6 +109,6 @@ def _curves(record: GaitRecord, norms: Norms | None) -> list[p.Html]:
     parts = [p.paragraph(text)]
     if norms:
         parts.append(p.paragraph("The grey band is the mean ±1 standard deviation of the reference given."))
-    for name in _SHOWN:
+    for name in _OPEN_JOINTS:
         parts += [p.heading(name), plots.pop(name)] if name in plots else []
     return [*parts, *([p.folded("Other joints", p.chooser("Joint", plots))] if plots else [])]

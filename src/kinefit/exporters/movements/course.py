@@ -12,7 +12,7 @@ from kinefit.exporters.report.feet import BALL, HEEL, peaks, smoothed
 from kinefit.motion import Motion, rotation_between_up
 
 _FLOOR_PERCENTILE = 5.0  # of the lower sole's height
-_MIN_DEPTH, _SETTLED = 0.1, 0.05  # shares: of the stature that hips sink at least; of a drop that is bottom or top
+_MIN_DEPTH, _END_SHARE = 0.1, 0.05  # shares: of the stature that hips sink at least; of a drop that is bottom or top
 _HEIGHT_NOISE_M = 0.002  # of smooth hips from frame to frame; what lasts moves no time
 _MIN_APART_S = 0.5  # between two lowest places
 
@@ -125,4 +125,4 @@ class Course:
 
 def _ends_of(rise: NDArray) -> tuple[int, int]:
     """Last frame at the bottom and first frame at the top of a course that rises from zero."""
-    return int(np.argmax(rise > _SETTLED * rise.max())) - 1, int(np.argmax(rise > (1.0 - _SETTLED) * rise.max()))
+    return int(np.argmax(rise > _END_SHARE * rise.max())) - 1, int(np.argmax(rise > (1.0 - _END_SHARE) * rise.max()))

@@ -20,8 +20,8 @@ def squats(course: Course, flights: list[Repetition]) -> list[Repetition]:
         depth = course.hips[drop.begin] - course.hips[drop.low]
         values = {
             "depth [m]": (float(depth), float(np.sqrt(2.0) * course.height_std[drop.low])),
-            "time down [s]": (down - start, float(np.hypot(*stds[:2]))),
-            "time up [s]": (stop - up, float(np.hypot(*stds[2:]))),
+            "time down [s]": (down - start, float(np.hypot(stds[0], stds[1]))),
+            "time up [s]": (stop - up, float(np.hypot(stds[2], stds[3]))),
             **{f"{side} knee flexion [deg]": _knee(course, drop, side[0]) for side in ("left", "right")},
         }  # fmt: skip
         out.append(Repetition("squat", start, stop, values))
