@@ -58,13 +58,13 @@ def write_gait_page(
     if motion.body.stature:
         facts["Stature"] = f"{motion.body.stature:.2f} m"
     walked = listed([walk.name for walk in record.walks], 8)
-    subject = session.get("subject") or motion.name
+    subject = f" of {session['subject']}" if session.get("subject") else ""
     sections = [
         p.section("Gait", p.facts(facts), *(p.callout("note", note) for note in record.notes), *_numbers(record)),
         p.section("Curves over the cycle", *_curves(record, norms)),
         p.section("How it is measured", p.bullets(_DEFINITIONS)),
     ]
-    write_text(path, p.page(f"Gait record of {subject}", sections, subtitle=f"{date}. {walked}."))
+    write_text(path, p.page(f"Gait record{subject}", sections, subtitle=f"{date}. {walked}."))
     return Path(path)
 
 

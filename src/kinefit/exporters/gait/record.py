@@ -169,11 +169,9 @@ def _walk(name: str, motion: Motion) -> Walk | str:
     """What is walked in a motion; a sentence where nothing is."""
     seen = np.flatnonzero(motion.quality > 0.0)
     notes = []
-    if len(seen) and len(seen) < len(motion):
-        first, last = int(seen[0]), int(seen[-1])
-        if last - first + 1 < len(motion):
-            notes.append(f"frames before {first} and after {last} are left out: nobody was seen.")
-            motion = motion.part(slice(first, last + 1))
+    if len(seen) and seen[-1] - seen[0] + 1 < len(motion):
+        notes.append(f"frames before {seen[0]} and after {seen[-1]} are left out: nobody was seen.")
+        motion = motion.part(slice(int(seen[0]), int(seen[-1]) + 1))
     fault = "nobody was seen" if not len(seen) else _posture_fault(motion)
     feet = None if fault else foot_events(motion)
     if feet is None:
@@ -283,7 +281,7 @@ def _check_one_person(motions: Mapping[str, Motion]) -> list[str]:
             raise ObservationError(problem, file=other, remedy=remedy)
         one, two = motions[first].lasting, motions[other].lasting
         if one is not None and two is not None and differ(one, two):
-            doubts.append(f"lengths in {other} differ from {first} by more than their error bars: one person?")
+            doubts.append(f"Lengths in {other} differ from {first} by more than their error bars: is it one person?")
     return doubts
 
 
