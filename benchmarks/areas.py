@@ -127,6 +127,9 @@ AREAS: dict[str, dict[str, str]] = {
     },
     "gait": {
         "gait_events": "contacts, toe-offs and steps of laboratory files, against plates and their own events",
+        "gait_record": "records of laboratory files by the command",
+        "gait_movements": "jumps against force plates; squats and rises from a seat counted",
+        "gait_mass": "centre of mass of laboratory files, against the double integral of plates' forces",
     },
     "sigma": {
         "sigma": "ranges of five joints and bars of all joint centres, from two and four cameras and from markers",

@@ -12,7 +12,6 @@ from kinefit import fit_marker_subject, fit_markers, load_body, read_markers
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.fitting.markers.poses import columns, sequence_both_ways
 from kinefit.geometry.losses import SQUARED
-from kinefit.rigs.people.floor import centre_of_mass
 from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.solving.trajectory.sequence import fit_sequence
 
@@ -59,7 +58,7 @@ def squats() -> None:
     left = np.nanmean(motion.residuals["markers"].norms, axis=1)
     print(f"# squats: residual {1e3 * left.mean():.2f} mm on average, {1e3 * left.max():.1f} mm in the worst frame")
     figure("faults_solver_squats_over_10mm", int(np.sum(left > MAX_RESIDUAL)), "frames", "== 0")
-    acceleration = np.diff(centre_of_mass(motion), 2, axis=0) * motion.rate**2
+    acceleration = np.diff(motion.centre_of_mass, 2, axis=0) * motion.rate**2
     figure("faults_solver_squats_jump", float(np.linalg.norm(acceleration, axis=1).max()) / GRAVITY, "g", "<= 6")
 
 

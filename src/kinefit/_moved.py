@@ -11,7 +11,7 @@ from typing import Any
 
 MOVED = {
     "app": "studio.app", "assets": "readers.assets", "batch": "takes.batch", "batch.viewed": "studio.viewers.viewed",
-    "bodies.anny": "bodies.morphs.anny", "bodies.body_surfaces": "bodies.surfaces.places", "calibration": "rigs",
+    "bodies.joint_names": "bodies.toml.joint_names", "bodies.anny": "bodies.morphs.anny", "bodies.body_surfaces": "bodies.surfaces.places", "calibration": "rigs",
     "correspondences": "solving.correspondences", "diagnostics": "rigs.diagnostics",
     "diagnostics.sensors": "sensors.alignment", "diagnostics.views": "fitting.multiview.views",
     "evaluation": "simulation.evaluation", "frame": "fitting.frame", "identification": "markers",

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tests.exporters.synthetic import smooth_motion
 
-from kinefit.bodies.joint_names import conventions, plain
+from kinefit.bodies.toml.joint_names import conventions, plain
 from kinefit.exporters import write_glb, write_jsonl
 
 FOLDER = Path(__file__).resolve().parents[2] / "blender"

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.joint_names import FAMILIES, joint_map
 from kinefit.bodies.limbs import FACE
+from kinefit.bodies.toml.joint_names import FAMILIES, joint_map
 
 BODY = load_body("humanoid_face")
 TREE = BODY.tree

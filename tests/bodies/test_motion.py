@@ -9,6 +9,7 @@ import pytest
 from tests.oracle import posture
 
 from kinefit.bodies import load_body
+from kinefit.bodies.masses import segment_masses
 from kinefit.bodies.motion import UP_AXES, Motion, Residuals, rotation_between_up
 from kinefit.errors import ExportError, ObservationError
 from kinefit.exporters.tables import tables
@@ -131,6 +132,33 @@ def test_five_lines_tell_what_a_motion_is():
 def test_joint_centres_are_the_origins_of_the_segments():
     np.testing.assert_array_equal(MOTION.joint_centres, MOTION.segment_poses()[..., :3, 3])
     assert MOTION.joint_centres.shape == (4, len(BODY.joints), 3)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_the_centre_of_mass_moves_with_the_body(up):
+    motion = MOTION.turned(up)
+    T = se3.exp(np.array([0.3, -0.2, 0.5, 0.0, 0.0, 0.4] if up == "z" else [0.3, -0.2, 0.5, 0.0, 0.4, 0.0]))
+    np.testing.assert_allclose(motion.moved(T).centre_of_mass, se3.apply(T, motion.centre_of_mass), atol=1e-9)
+    found = segment_masses(BODY)
+    for frame in range(len(motion)):
+        Ts = motion.segment_poses()[frame]
+        places = [se3.apply(Ts[s], found.centres[s]) for s in range(len(found.masses))]
+        np.testing.assert_allclose(motion.centre_of_mass[frame], found.masses @ places / found.masses.sum(), atol=1e-9)
+
+
+def test_the_error_of_the_centre_of_mass_is_between_those_of_joints():
+    std = MOTION.centre_of_mass_std
+    assert std.shape == (4, 3)
+    assert np.all(std > MOTION.joint_std.min(axis=1)) and np.all(std < MOTION.joint_std.max(axis=1))
+    table = tables(MOTION, unit="mm")["joints"]
+    np.testing.assert_allclose(table["com z [mm]"], 1000.0 * MOTION.centre_of_mass[:, 2])
+    np.testing.assert_allclose(table["com x std [mm]"], 1000.0 * std[:, 0])
+
+
+def test_another_mass_is_of_the_same_motion():
+    child = MOTION.with_mass(32.0)
+    assert child.body.mass == 32.0 and MOTION.with_mass(None) is MOTION
+    np.testing.assert_allclose(child.centre_of_mass, MOTION.centre_of_mass, atol=1e-9)
 
 
 def test_a_data_frame_has_the_columns_of_the_tables(monkeypatch):

@@ -89,7 +89,7 @@ def digest(motion):
     """What a motion tells, as bytes; how long anything took is not in it."""
     arrays = [motion.times, motion.Ts_world_root, motion.angles, motion.dof_std, motion.body.tree.offsets]
     arrays += [r.values for r in motion.residuals.values()]
-    told = (motion.name, motion.up, motion.rate, motion.body.name, tuple(motion.residuals))
+    told = (motion.name, motion.up, motion.rate, motion.body.name, motion.body.mass, tuple(motion.residuals))
     return repr(told).encode() + b"".join(np.round(a, 9).tobytes() for a in arrays)
 
 
@@ -122,7 +122,7 @@ def acts_or_is_refused(make, usual):
 
 HEAD = {
     "name": 'name = "another"', "rate": "rate = 5.0", "up": 'up = "x"', "body": 'body = "humanoid39"',
-    "height": "height = 1.3", "subject": 'subject = "take.toml"', "start": 'start = "other.npz"',
+    "height": "height = 1.3", "mass": "mass = 32.0", "subject": 'subject = "take.toml"', "start": 'start = "other.npz"',
     "frames": "frames = [0, 4]", "size": "size = false", "person": "person = 2", "bands": "bands = { neck = 0.01 }",
 }  # fmt: skip
 OWN = {

@@ -152,7 +152,7 @@ def test_one_camera_is_told_from_the_start(take, tmp_path):
     [("track", "{take}", "--out", "{file}"), ("check", "{take}", "--out", "{folder}"),
      ("check", "{take}", "--out", "{file}/page.html"), ("init", "{folder}", "--force", "--out", "{file}/take.toml"),
      ("export", "none.npz", "--to", "bvh", "--out", "{folder}"),
-     ("export", "none.npz", "--to", "csv", "--out", "{file}"),
+     ("export", "none.npz", "--to", "csv", "--out", "{file}"), ("gait", "none.npz", "--out", "{file}"),
      ("view", "{take}", "--html", "{folder}"), ("calibrate", "people", "{take}", "--out", "{file}/c.toml"),
      ("retarget", "none.bvh", "--out", "{folder}"), ("markers", "learn", "none.c3d", "--out", "{folder}"),
      ("markers", "identify", "none.c3d", "none.json", "--out", "{folder}"),

@@ -14,6 +14,7 @@ from tests.conftest import ROOT
 from tests.docs import drawn
 from tests.docs.blocks import blocks
 from tests.docs.world import world
+from tests.exporters.report.test_cycles import walk as walking
 
 from kinefit import Markers, learn_model
 from kinefit.bodies.marker_sets import placement
@@ -167,6 +168,14 @@ def which_setup(folder):
     yield
 
 
+def gait(folder):
+    for name in ("walk1", "walk2"):
+        write_motion(walking(), folder / "monday" / name / "motion.npz")
+    write_motion(squat_and_wave(), folder / "squats" / "motion.npz")
+    (folder / "adults.csv").write_text(blocks("gait", "text")[0].text)
+    yield
+
+
 def motion(folder):
     write_motion(world().motion, folder / "motion.npz")
     yield
@@ -195,6 +204,7 @@ def sapm(folder):
 PREPARED = {
     "README": nothing, "app": nothing, "batch": batch, "blender": blender, "calibration": calibration, "check": take,
     "closed-chains": nothing, "comparison": comparison, "detect": nothing, "first-recording": first_recording,
+    "gait": gait,
     "index": nothing, "init": init, "install": nothing, "live": take, "one-camera": nothing,
     "depth": depth_fusion, "silhouettes": nothing,
     "printed-sapm": sapm, "regions": nothing, "sensors": walk, "simulate": simulate, "surfaces": surfaces,

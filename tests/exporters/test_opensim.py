@@ -78,11 +78,25 @@ def test_limits_masses_and_bodies_are_usable(tmp_path):
         assert principal[0] > 0 and principal[0] + principal[1] >= principal[2]
 
 
+def test_the_mass_given_and_its_centres_are_in_the_model(tmp_path):
+    motion = smooth_motion(3).with_mass(32.0)
+    write_osim(motion.body, tmp_path / "a.osim")
+    write_mot(motion, tmp_path / "a.mot")
+    model, poses = poses_by_opensim(tmp_path / "a.osim", read_mot(tmp_path / "a.mot"))
+    masses, centres = [], []
+    for body in model.iter("Body"):
+        masses.append(float(body.find("mass").text))
+        centres.append(se3.apply(poses[body.get("name")], np.array(body.find("mass_center").text.split(), float)))
+    assert sum(masses) == pytest.approx(32.0)
+    centre = np.einsum("s,sfi->fi", masses, centres) / 32.0
+    np.testing.assert_allclose(centre, motion.turned("y").centre_of_mass, atol=1e-6)
+
+
 @pytest.mark.parametrize("end", [(0.0, 0.3, 0.0), (0.1, -0.2, 0.05), (0.0, -0.3, 0.0), (0.3, 0.0, 0.0)])
 def test_inertia_is_that_of_a_round_rod(end):
     from kinefit.bodies import TaperedCylinder
 
-    mass, centre, inertia = mass_properties("thing", [TaperedCylinder.round(0, end, (0.05, 0.05))])
+    mass, centre, inertia = mass_properties([TaperedCylinder.round(0, end, (0.05, 0.05))])
     length = np.linalg.norm(end)
     assert mass == pytest.approx(1000 * np.pi * 0.05**2 * length)
     u = np.array(end) / length

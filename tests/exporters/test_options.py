@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tests.exporters.synthetic import smooth_motion
 
 from kinefit.bodies import load_body
-from kinefit.bodies.joint_names import CHARACTER_BONES, segment_names
+from kinefit.bodies.toml.joint_names import CHARACTER_BONES, segment_names
 from kinefit.errors import ExportError
 from kinefit.exporters import tables, write_bvh, write_c3d, write_csv, write_glb, write_trc, write_usd
 from kinefit.exporters.skeletons.common import NAMES, bone_names

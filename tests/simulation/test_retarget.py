@@ -7,8 +7,8 @@ import pytest
 from tests.readers.skeletons.bvh_variants import along, any_frames, turned, write_variant
 
 from kinefit.bodies import load_body
-from kinefit.bodies.joint_names import recorded_joints
 from kinefit.bodies.motion import rotation_between_up
+from kinefit.bodies.toml.joint_names import recorded_joints
 from kinefit.errors import BodyError, ObservationError
 from kinefit.findings import of_provenance
 from kinefit.geometry import se3

@@ -119,6 +119,7 @@ class Body:
     surfaces : tapered elliptical cylinders and meshes; a segment may have several, or none.
     aliases : convention ("opensim", "bvh", "hanim") -> segment name -> name in that convention.
     stature : float [m], height when standing.
+    mass : float [kg] of the person, or machine; 0 if unknown, see `masses.segment_masses`.
     morphs : shape changes that depend on the angles; `Morphing` applies them.
     skin : SkinnedMesh, a surface over all segments; depth sensors and rendering use `surfaces`.
     family : BodyFamily that this body belongs to; files do not store it.
@@ -137,6 +138,7 @@ class Body:
     surfaces: tuple[Surface, ...] = ()
     aliases: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     stature: float = 0.0
+    mass: float = 0.0
     morphs: tuple[Operator, ...] = ()
     skin: SkinnedMesh | None = None
     family: BodyFamily | None = None

@@ -101,9 +101,17 @@ def common(first: LastingErrors, second: LastingErrors) -> NDArray | None:
         return None
     names = [name for name in first.parameters.names if name in second.parameters.names]
     a, b = first.parameters.of(names), second.parameters.of(names)
-    if not names or a.misfit(b) > _MAX_MISFIT:
+    if not names or differ(first, second):
         return None
     return a.unresolved @ b.unresolved.T
+
+
+def differ(first: LastingErrors, second: LastingErrors) -> bool:
+    """Whether two motions measured parameters that differ by more than their errors, as those of two people do."""
+    if first.parameters is None or second.parameters is None:
+        return False
+    names = [name for name in first.parameters.names if name in second.parameters.names]
+    return bool(names) and first.parameters.of(names).misfit(second.parameters.of(names)) > _MAX_MISFIT
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.lasting_errors import LastingErrors
+from kinefit.bodies.masses import segment_masses
 from kinefit.bodies.tree import BodyState
 from kinefit.errors import ExportError, ObservationError, check_choice
 from kinefit.geometry import se3
@@ -232,9 +233,12 @@ class Motion:
     def parts(self, frames: int = _FRAMES_PER_BLOCK) -> Iterator[Motion]:
         """Its stretches of so many frames, without residuals: what is computed of one takes little memory."""
         for start in range(0, max(len(self), 1), frames):
-            arrays = {name: getattr(self, name)[start : start + frames] for name in ARRAYS}
-            lasting = self.lasting and self.lasting.part(slice(start, start + frames))
-            yield replace(self, residuals={}, lasting=lasting, **arrays)
+            yield self.part(slice(start, start + frames))
+
+    def part(self, frames: slice) -> Motion:
+        """A stretch of its frames, without residuals."""
+        arrays = {name: getattr(self, name)[frames] for name in ARRAYS}
+        return replace(self, residuals={}, lasting=self.lasting and self.lasting.part(frames), **arrays)
 
     def frame_at(self, time: float) -> int | None:
         """Frame nearest to a time [s], None where there is none within one frame."""
@@ -252,6 +256,31 @@ class Motion:
     def joint_centres(self) -> NDArray:
         """(F, S, 3) [m] joint centres in the world, in the order of `body.joints`; `joint_std` are their deviations."""
         return np.concatenate([part.segment_poses()[..., :3, 3].copy() for part in self.parts()])
+
+    def with_mass(self, mass: float | None) -> Motion:
+        """The same motion of a person of another mass [kg]; None: unchanged."""
+        return self if mass is None else replace(self, body=replace(self.body, mass=mass))
+
+    @property
+    def centre_of_mass(self) -> NDArray:
+        """(F, 3) [m] of the person in the world, without gear, by `segment_masses` of the body."""
+        found = segment_masses(self.body)
+        shares = found.masses / found.masses.sum()
+        parts = (part.segment_poses() for part in self.parts())
+        return np.concatenate([
+            np.einsum("s,fsi->fi", shares, Ts[..., :3, 3] + np.einsum("fsij,sj->fsi", Ts[..., :3, :3], found.centres))
+            for Ts in parts
+        ])  # fmt: skip
+
+    @property
+    def centre_of_mass_std(self) -> NDArray:
+        """(F, 3) [m] upper bound of its standard deviation along the world's axes, as if all joints erred together.
+
+        What people differ from the table of masses is not in it.
+        """
+        masses = segment_masses(self.body).masses
+        used = masses > 0.0
+        return np.asarray(np.einsum("s,fsi->fi", masses[used] / masses.sum(), self.joint_std[:, used]))
 
     def to_dataframe(self) -> Any:
         """A pandas data frame of one row a frame: the columns of the tables `angles` and `joints`, and the quality.
@@ -387,10 +416,17 @@ def angle_columns(motion: Motion, factor: float = 1.0, unit: str = "m") -> Colum
 def joint_columns(
     motion: Motion, names: Sequence[str] | None = None, factor: float = 1.0, unit: str = "m"
 ) -> Columns:
-    """Joint centres and their standard deviations along the world's axes; `names` default to the body's joints."""
+    """Joint centres and the centre of mass, "com", with standard deviations along the world's axes.
+
+    `names` default to the body's joints.
+    """
     names = names or motion.body.joints
-    centres = place_columns(names, factor * motion.joint_centres, unit)
-    return centres | place_columns(names, factor * motion.joint_std, unit, " std")
+    names, out = (*names, "com"), Columns()
+    for suffix, joints, centre in (
+        ("", motion.joint_centres, motion.centre_of_mass), (" std", motion.joint_std, motion.centre_of_mass_std)
+    ):  # fmt: skip
+        out |= place_columns(names, factor * np.concatenate([joints, centre[:, None]], axis=1), unit, suffix)
+    return out
 
 
 def place_columns(names: Sequence[str], positions: NDArray, unit: str, suffix: str = "") -> Columns:

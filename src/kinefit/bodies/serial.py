@@ -4,6 +4,7 @@ S segments, D coordinates, G scale groups; names are arrays of text, indices int
 radians:
 
     name ()  stature ()  root_free ()                  the body; stature [m]
+    mass ()                                            [kg]; may be missing
     segments (S,)  joints (S,)  parents (S,)           parents: index, -1 for the root
     offsets (S, 3)                                     joint centre in the parent's frame at rest [m]
     coordinates (D,)  owners (D,)  axes (D, 3)         owners: segment moved; axes in the root-aligned rest frame
@@ -56,7 +57,7 @@ from kinefit.bodies.morphs.anny import fetched_anny
 from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph, Steering
 from kinefit.bodies.surfaces import MeshSurface, Metaballs, SkinnedMesh, Surface, TaperedCylinder
 from kinefit.bodies.toml.bodies import read_toml_body
-from kinefit.bodies.toml.records import stature_of
+from kinefit.bodies.toml.records import size_of
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError
 
@@ -65,7 +66,7 @@ _Kind = TypeVar("_Kind")
 _WEIGHT_ROWS = 1025  # of a stored weighting function
 
 _SHAPES = {
-    "body": {"name": "$", "stature": "", "joints": "S$", "scale_groups": "G$", "segment_scale": "S<G"},
+    "body": {"name": "$", "stature": "", "mass": "", "joints": "S$", "scale_groups": "G$", "segment_scale": "S<G"},
     "tree": {
         "segments": "S$", "parents": "S", "offsets": "S 3", "coordinates": "D$", "owners": "D<S", "axes": "D 3",
         "prismatic": "D", "lower": "D", "upper": "D", "usual": "D", "spread": "D", "root_free": "", "couplings": "C D",
@@ -183,11 +184,11 @@ def body_from_arrays(arrays: Arrays) -> Body:
         raise BodyError("the first segment is not the root")
     if (tree.parents[1:] < 0).any():
         raise BodyError("array 'parents' has an index out of range", remedy="Only the root has none, -1.")
-    own = fields_of(arrays, _SHAPES["body"], sizes)
+    own = fields_of({"mass": np.zeros(()), **arrays}, _SHAPES["body"], sizes)
     points = lambda prefix: PointSet(**fields_of(arrays, _SHAPES["points"], sizes, prefix))
     aliases = {key: fields_of(arrays, {key: "n 2$"}, {})[key] for key in arrays if key.startswith("aliases/")}
     body = Body(
-        **own | {"stature": stature_of(own["stature"])},
+        **own | {key: size_of(key, own[key]) for key in ("stature", "mass")},
         tree=tree,
         landmarks=points("landmarks/"),
         keypoint_sets={name: points(prefix) for name, prefix in prefixes(arrays, "keypoints").items()},

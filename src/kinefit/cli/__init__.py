@@ -29,6 +29,7 @@ COMMANDS = {
     "check": "checks.check", "track": "tracking.track", "live": "tracking.live", "batch": "tracking.track",
     "markers": "markers.markers", "surface": "surfaces.surface", "body": "body", "view": "view", "app": "view",
     "replay": "motions.simulate", "export": "motions.simulate", "retarget": "motions.simulate",
+    "gait": "motions.gait", "movements": "motions.movements",
     "simulate": "motions.simulate", "evaluate": "motions.simulate", "warmup": "warmup",
 }  # fmt: skip
 """Commands in the order of use, and their modules."""
@@ -44,6 +45,7 @@ Examples:
   kinefit markers --help                optical markers: label them, fit a body to them
   kinefit surface --help                photographs of a textured surface: points, strain
   kinefit export motion.npz --to bvh    write a motion in another format
+  kinefit gait motion.npz --report      strides, steps and symmetry of a walk
   kinefit COMMAND --help                options of a command, with examples
 
 \b

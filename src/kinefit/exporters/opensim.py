@@ -6,7 +6,6 @@ ground_pelvis joint: the way of its origin, then turns about its own z (tilt), x
 
 from __future__ import annotations
 
-import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from itertools import chain, count
@@ -18,18 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import write_lines, write_text
-from kinefit.bodies import Body, PointSet, TaperedCylinder
+from kinefit.bodies import Body, PointSet
+from kinefit.bodies.masses import rod, segment_masses
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.surfaces import Surface
 from kinefit.errors import ExportError
 from kinefit.exporters.skeletons.common import UNITS, check_up, euler, euler_zxy, length_factor, numbers, plain_names
-
-PERSON = 75.0  # [kg]
-SHARES = {
-    "head": 0.0694, "thorax": 0.1396, "clavicle": 0.01, "abdomen": 0.1633, "pelvis": 0.1117, "upperarm": 0.0271,
-    "forearm": 0.0162, "hand": 0.0061, "thigh": 0.1416, "shank": 0.0433, "foot": 0.0117, "toes": 0.002,
-}  # fmt: skip
-"""Share of a segment in a person's mass (de Leva 1996; collar bones and toes are taken out of trunk and foot)."""
 
 _DENSITY_KG_M3, _MIN_MASS_KG = 1000.0, 0.01  # [kg/m³], [kg]
 _EYE, _ZERO = np.eye(3), "0 0 0"
@@ -40,7 +33,7 @@ def model(body: Body, root_coordinates: list[str], path: str | PathLike[str]) ->
 
     Raises ExportError for a joint of more than three turns or three ways.
     """
-    tree = body.tree
+    tree, found = body.tree, segment_masses(body)
     names = plain_names(body.alias("opensim", s) for s in tree.segments)
     coordinates = plain_names(tree.coordinates)
     out = ET.Element("Model", name=plain_names([body.name])[0])
@@ -49,7 +42,8 @@ def model(body: Body, root_coordinates: list[str], path: str | PathLike[str]) ->
     joints = ET.SubElement(ET.SubElement(out, "JointSet"), "objects")
     markers = ET.SubElement(ET.SubElement(out, "MarkerSet"), "objects")
     for s, name in enumerate(names):
-        bodies.append(_body(name, tree.segments[s], [c for c in body.surfaces if c.segment == s]))
+        mass, centre = (float(found.masses[s]), found.centres[s]) if found.masses[s] > 0.0 else (0.0, None)
+        bodies.append(_body(name, [c for c in body.surfaces if c.segment == s], mass, centre))
         parent = "/ground" if tree.parents[s] < 0 else f"/bodyset/{names[tree.parents[s]]}"
         dofs = range(tree.dof_start[s], tree.dof_start[s + 1])
         moves = {d: (coordinates[d], tree.axes[d], _limits(tree.lower[d], tree.upper[d])) for d in dofs}
@@ -124,8 +118,8 @@ def _limits(low: float, high: float) -> tuple[float, float]:
     return max(float(low), -99999.9), min(float(high), 99999.9)
 
 
-def _body(name: str, segment: str, surfaces: Sequence[Surface]) -> ET.Element:
-    mass, centre, inertia = mass_properties(segment, surfaces)
+def _body(name: str, surfaces: Sequence[Surface], mass: float, centre: NDArray | None) -> ET.Element:
+    mass, centre, inertia = mass_properties(surfaces, mass, centre)
     out = ET.Element("Body", name=name)
     _texts(
         out, mass=mass, mass_center=centre,
@@ -133,7 +127,7 @@ def _body(name: str, segment: str, surfaces: Sequence[Surface]) -> ET.Element:
     )  # fmt: skip
     components = ET.SubElement(out, "components") if surfaces else out
     for k, surface in enumerate(surfaces):
-        middle, R_body_cylinder, length, radii = _rod(surface)
+        middle, R_body_cylinder, length, radii = rod(surface)
         label = f"{name}_{k + 1}" if k else name
         frame = ET.SubElement(components, "PhysicalOffsetFrame", name=f"{label}_axis")
         geometry = ET.SubElement(ET.SubElement(frame, "attached_geometry"), "Cylinder", name=f"{label}_surface")
@@ -145,34 +139,24 @@ def _body(name: str, segment: str, surfaces: Sequence[Surface]) -> ET.Element:
     return out
 
 
-def _rod(surface: Surface) -> tuple[NDArray, NDArray, float, NDArray]:
-    """Middle (3,) [m], rotation (3, 3) from an upright cylinder, length [m] and half axes (2,) [m] along its x and z.
+def mass_properties(
+    surfaces: Sequence[Surface], mass: float = 0.0, centre: NDArray | None = None
+) -> tuple[float, NDArray, NDArray]:
+    """Mass [kg], centre of mass (3,) [m] and inertia (3, 3) [kg m²] about it, of elliptical rods along the surfaces.
 
-    Of a mesh: the elliptical cylinder in the box along its principal directions.
+    Without a mass (of gear) they are filled with water; the centre is that of the rods where it is not given.
     """
-    if isinstance(surface, TaperedCylinder):
-        a, b, axis = surface.axes
-        middle = 0.5 * np.add(surface.start, surface.end)
-        return middle, np.stack([a, axis, -b], axis=1), surface.length, np.mean(surface.radii, axis=0)
-    middle, axes, size = surface.box()
-    R = np.stack([axes[1], axes[0], np.cross(axes[1], axes[0])], axis=1)
-    return middle, R, float(size[0]), 0.5 * size[1:]
-
-
-def mass_properties(segment: str, surfaces: Sequence[Surface]) -> tuple[float, NDArray, NDArray]:
-    """Mass [kg], centre of mass (3,) [m] and inertia (3, 3) [kg m²] about it, of elliptical rods along the surfaces."""
-    rods = [_rod(surface) for surface in surfaces] or [(np.array([0.0, 0.025, 0.0]), _EYE, 0.05, np.full(2, 0.02))]
+    rods = [rod(surface) for surface in surfaces] or [(np.array([0.0, 0.025, 0.0]), _EYE, 0.05, np.full(2, 0.02))]
     volumes = np.array([np.pi * length * radii[0] * radii[1] for _, _, length, radii in rods])
-    share = SHARES.get(re.sub("_[lr]$", "", segment))
-    mass = max(_MIN_MASS_KG, share * PERSON if share else _DENSITY_KG_M3 * float(volumes.sum()))
+    mass = max(_MIN_MASS_KG, mass or _DENSITY_KG_M3 * float(volumes.sum()))
     masses = mass * volumes / volumes.sum()
-    centre = sum(m * middle for m, (middle, _, _, _) in zip(masses, rods)) / mass
+    middle_of_rods = sum(m * middle for m, (middle, _, _, _) in zip(masses, rods)) / mass
     inertia = np.zeros((3, 3))
     for m, (middle, R, length, (a, b)) in zip(masses, rods):
         own = m * np.diag([b**2 / 4 + length**2 / 12, (a**2 + b**2) / 4, a**2 / 4 + length**2 / 12])
-        away = middle - centre
+        away = middle - middle_of_rods
         inertia += R @ own @ R.T + m * ((away @ away) * _EYE - np.outer(away, away))
-    return mass, centre, inertia
+    return mass, middle_of_rods if centre is None else centre, inertia
 
 
 def _texts(parent: ET.Element, **texts: str | ArrayLike) -> None:
@@ -259,8 +243,8 @@ def write_mot(motion: Motion, path: str | PathLike[str]) -> None:
 def write_osim(body: Body, path: str | PathLike[str]) -> None:
     """Write a body as an OpenSim 4 model: joints, coordinates with limits, masses, landmarks as markers, cylinders.
 
-    The masses are the usual shares of a person of 75 kg (de Leva 1996); where a segment has no share of its own, that
-    of its surface filled with water. They are there so that the model can be used at once, not measured.
+    Masses and their centres are those of `bodies.masses.segment_masses`: shares by de Leva (1996) of `Body.mass`, or of
+    the mean mass of people of this stature. Gear is filled with water. Inertias are those of rods along the surfaces.
 
     Raises
     ------

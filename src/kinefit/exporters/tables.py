@@ -2,7 +2,7 @@
 
     angles      one row a frame: every coordinate [deg] (sliding ones [m]) with its standard deviation; the root as
                 place [m] and unit quaternion in the world, its deviations along [m] and about [deg] the world's axes
-    joints      joint centres [m] with standard deviations along the world's axes
+    joints      joint centres and centre of mass (com) [m] with standard deviations along the world's axes
     landmarks   landmarks [m]
     quality     of the frame and of every segment, 0..1
     residuals   long form, one row a sensor, frame and point that was seen: measured, measured minus fitted, weight; of
@@ -15,7 +15,7 @@ deviation "inf" means that nothing observed it.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from os import PathLike
@@ -183,7 +183,7 @@ def write_csv(
     ExportError
         Unknown unit, axis or names, or a file cannot be written.
     """
-    return _write(_in_pieces(motion, unit, up, names), Path(folder), ".csv", _to_csv)
+    return _write(_in_pieces(motion, unit, up, names), Path(folder), ".csv", to_csv)
 
 
 def write_parquet(
@@ -196,12 +196,23 @@ def write_parquet(
     ExportError
         The extra "parquet" is not installed; and as `write_csv`.
     """
+    about = {"name": motion.name, "rate [Hz]": repr(float(motion.rate)), "up": up or motion.up}
+    return _write(_in_pieces(motion, unit, up, names), Path(folder), ".parquet", parquet_writer(folder, about))
+
+
+def parquet_writer(folder: str | PathLike[str], about: dict[str, str]) -> Callable[[Iterable[Table], Path], None]:
+    """A function (pieces of a table, file) that writes Parquet, with `about` in the metadata; `folder` for messages.
+
+    Raises
+    ------
+    ExportError
+        The extra "parquet" is not installed.
+    """
     with extra("parquet", "Parquet needs the package pyarrow", ExportError, file=folder):
         import pyarrow
         import pyarrow.parquet
-    about = {"name": motion.name, "rate [Hz]": repr(float(motion.rate)), "up": up or motion.up}
 
-    def to_parquet(pieces: Iterator[Table], file: Path) -> None:
+    def to_parquet(pieces: Iterable[Table], file: Path) -> None:
         with ExitStack() as stack:
             writer = None
             for table in pieces:
@@ -211,7 +222,7 @@ def write_parquet(
                     writer = stack.enter_context(pyarrow.parquet.ParquetWriter(file, content.schema))
                 writer.write_table(content)
 
-    return _write(_in_pieces(motion, unit, up, names), Path(folder), ".parquet", to_parquet)
+    return to_parquet
 
 
 def tables(
@@ -328,7 +339,19 @@ def _write(
     return tuple(files)
 
 
-def _to_csv(pieces: Iterator[Table], file: Path) -> None:
+def quantity_table(rows: Sequence[Any], names: Iterable[str], quantities: Iterable[str]) -> Table:
+    """Columns of attributes, texts or times [s], and of `values` {quantity [unit]: (value, standard deviation)}."""
+    each = {name: [getattr(row, name) for row in rows] for name in names}
+    out: Table = {f"{n} [s]" if n in ("start", "stop") else n: np.array(of) for n, of in each.items()}
+    for name in quantities:
+        stem, unit = name.split(" [")
+        values, stds = np.array([row.values.get(name, (np.nan, np.nan)) for row in rows]).T
+        out |= {name: values, f"{stem} std [{unit}": stds}
+    return out
+
+
+def to_csv(pieces: Iterable[Table], file: Path) -> None:
+    """Write pieces of a table, (rows,) of each column, as CSV."""
     with open(file, "w", encoding="utf-8", newline="\n") as out:
         rows = csv.writer(out, lineterminator="\n")
         for number, table in enumerate(pieces):

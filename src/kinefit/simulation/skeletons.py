@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.joint_names import SIDES, Recorded, recorded_joints
 from kinefit.bodies.motion import rotation_between_up
+from kinefit.bodies.toml.joint_names import SIDES, Recorded, recorded_joints
 from kinefit.errors import ObservationError
 from kinefit.findings import Finding
 from kinefit.geometry import se3

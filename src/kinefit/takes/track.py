@@ -103,11 +103,11 @@ def track_take(
                 progress=progress, checkpoint=checkpoint,
             )  # fmt: skip
         except TrackingInterrupted as stopped:
-            motion = with_findings(stopped.motion, findings, seen, take.height)
+            motion = with_findings(stopped.motion.with_mass(take.mass), findings, seen, take.height)
             raise TrackingInterrupted(motion, stopped.total) from None
         except KinefitError as error:
             raise with_cause(error, findings) from error
-    motion = with_findings(motion, findings, seen, take.height)
+    motion = with_findings(motion.with_mass(take.mass), findings, seen, take.height)
     motion = on_floor(motion, recording, view.floors if view else [])
     if seen.rig is not None:
         seen = replace(seen, rig=rig_on_floor(as_found(seen.rig, motion.provenance), motion.provenance))

@@ -1,5 +1,7 @@
 """What `kinefit markers fit` leaves in a folder."""
 
+import re
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -9,8 +11,8 @@ from kinefit import Markers, read_markers, read_motion, read_take
 from kinefit.bodies import PointSet
 from kinefit.bodies.marker_sets import placement
 from kinefit.cli import main
-from kinefit.cli.markers._fit import WRITTEN, fit_file
-from kinefit.errors import ExportError, FileError, TakeError
+from kinefit.cli.markers._fit import WRITTEN, MarkerFitOptions, fit_file
+from kinefit.errors import ExportError, FileError, ObservationError, TakeError
 from kinefit.exporters import write_markers
 from kinefit.geometry import se3
 from kinefit.simulation import squat_and_wave
@@ -59,6 +61,17 @@ def test_what_cannot_be_done_is_told_first(two_people, tmp_path):
     with pytest.raises(FileError, match="no such file"):
         fit_file(tmp_path / "none.c3d")
     assert not list(tmp_path.iterdir())
+
+
+def test_one_mass_is_of_one_person(two_people, tmp_path):
+    with pytest.raises(ObservationError, match="one mass for 2 people: Anna, Bob"):
+        fit_file(two_people, tmp_path, MarkerFitOptions(mass=60.0))
+    assert not list(tmp_path.iterdir())
+    write_markers(squat(10)[0], tmp_path / "child.trc")
+    run("markers", "fit", tmp_path / "child.trc", "--mass", 32, "--formats", "motion,osim")
+    assert read_motion(tmp_path / "child-kinefit").body.mass == 32.0
+    text = (tmp_path / "child-kinefit" / "body.osim").read_text()
+    assert sum(map(float, re.findall("<mass>(.*?)</mass>", text))) == pytest.approx(32.0)
 
 
 @pytest.mark.parametrize(

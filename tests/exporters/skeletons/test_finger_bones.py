@@ -8,7 +8,7 @@ from tests.exporters.skeletons.character_file import fingers, write_character_gl
 from tests.exporters.skeletons.test_characters import chunks, play, run, unit
 
 from kinefit.bodies import load_body
-from kinefit.bodies.joint_names import DIGITS
+from kinefit.bodies.toml.joint_names import DIGITS
 from kinefit.exporters import write_bvh, write_character, write_motion
 from kinefit.exporters.skeletons.retarget import in_words
 from kinefit.geometry import se3

@@ -11,7 +11,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.rigs.people.calibrate import calibrate_people
 from kinefit.rigs.people.first_rig import first_rig
-from kinefit.rigs.people.floor import centre_of_mass, settled
+from kinefit.rigs.people.floor import settled
 from kinefit.rigs.people.skeletons import steady_person
 from kinefit.simulation import simulate_keypoints
 
@@ -50,7 +50,7 @@ def test_the_world_stands_as_it_is_asked_to(found):
     tilted = se3.exp(np.array([1.0, 2.0, -1.0, 0.3, -0.5, 2.0]))
     rig = settled(
         room().moved(tilted), se3.apply(tilted, x), rest - rest.min(),
-        balance=se3.apply(tilted, centre_of_mass(walker())), up="y",
+        balance=se3.apply(tilted, walker().centre_of_mass), up="y",
     )
     heights = [c.centre_world[1] for c in rig]
     np.testing.assert_allclose(heights, [c.centre_world[2] for c in room()], atol=0.25)

@@ -33,7 +33,7 @@ def simulated(scene):
 @pytest.fixture
 def recorded(scene, tmp_path):
     """A record of the simulated take, whose second camera is half a frame late."""
-    text = '[take]\nup = "z"\nheight = 1.7\n[calibration]\nfile = "c.toml"\n'
+    text = '[take]\nup = "z"\nheight = 1.7\nmass = 61.5\n[calibration]\nfile = "c.toml"\n'
     from kinefit.readers.calibration.read import write_calibration
 
     (tmp_path / "own").mkdir()
@@ -54,6 +54,7 @@ def recorded(scene, tmp_path):
 def test_the_take_has_what_was_seen(recorded, scene):
     seen = load_observations(read_take(recorded.path))
     assert set(seen.rig.names) == set(scene.rig.names) and seen.rate == scene.motion.rate
+    assert (read_take(recorded.path).height, read_take(recorded.path).mass) == (1.7, 61.5)
     truth = {k.camera: k for k in simulated(scene)}
     for k in seen.keypoints:
         points, sure = truth[k.camera].points, (truth[k.camera].confidence > 0).all(axis=0)  # at all times

@@ -36,7 +36,7 @@ from kinefit.bodies.toml.records import (
     merged,
     mirrored,
     refuse_repeated,
-    stature_of,
+    size_of,
     with_images,
 )
 from kinefit.bodies.tree import COLUMNS, KinematicTree
@@ -123,7 +123,8 @@ def _body(record: FileRecord, source: str) -> Body:
             c: {s.name: s.names[c] for s in segments if c in s.names}
             for c in dict.fromkeys(c for s in segments for c in s.names)
         },
-        stature=stature_of(record.body.stature or 0.0),
+        stature=size_of("stature", record.body.stature or 0.0),
+        mass=size_of("mass", record.body.mass or 0.0),
         skin=skin_of(record.skin, tree, source),
         morphs=morphs_of(morph, tree, source),
     )  # fmt: skip

@@ -98,23 +98,25 @@ class HeadRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     name: str
     base: str | None = None
     stature: float | None = None
+    mass: float | None = None
     mirror: bool | None = None
 
 
-def stature_of(value: float) -> float:
-    """Check a stature [m] as stated in a file; 0 if not stated.
+def size_of(key: str, value: float) -> float:
+    """Check a "stature" [m] or "mass" [kg] as stated in a file; 0 if not stated.
 
     Raises
     ------
     BodyError
-        A number that is no stature.
+        A number that is none.
     """
-    if not 0 <= value <= _TALLEST:
-        raise BodyError(f"a stature of {value:g} m", place="body.stature", remedy="Give metres.")
+    most, unit, units = _MAX_SIZES[key]
+    if not 0 <= value <= most:
+        raise BodyError(f"a {key} of {value:g} {unit}", place=f"body.{key}", remedy=f"Give {units}.")
     return value
 
 
-_TALLEST = 100.0  # [m]: of machines, too
+_MAX_SIZES = {"stature": (100.0, "m", "metres"), "mass": (1e5, "kg", "kilograms")}  # of machines, too
 
 
 class MarkerSetRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

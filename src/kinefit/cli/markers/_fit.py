@@ -230,6 +230,7 @@ class MarkerFitOptions:
     limits : bool, whether joints stay within their ranges.
     sides : str, optional, one of `bodies.marker_sets.SIDES`: how sides are read; default: as labelled, checked.
     smooth : bool, whether all frames are fitted together, see `fit_markers`.
+    mass : float [kg], optional, of the subject; default: about that of people of the height.
     """
 
     body: str | Path = "humanoid"
@@ -240,6 +241,7 @@ class MarkerFitOptions:
     limits: bool = True
     sides: str | None = None
     smooth: bool = True
+    mass: float | None = None
 
 
 def fit_file(
@@ -280,6 +282,11 @@ def fit_file(
     _screen.check_folder(folder)
     generic = load_body(options.body)
     people = read_people(path, unit, options.sides)
+    if options.mass is not None:
+        if len(people) > 1:
+            problem = f"one mass for {len(people)} people: {', '.join(people)}"
+            raise ObservationError(problem, file=path, remedy="Leave out the mass, or fit one person's file at a time.")
+        generic = replace(generic, mass=options.mass)
     trials = read_people(options.static, unit, options.sides) if options.static else {}
     found: dict[str, tuple[Motion, dict[str, Path]]] = {}
     for person, whole in people.items():

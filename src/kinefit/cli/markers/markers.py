@@ -191,6 +191,7 @@ Examples:
 @click.option("--body", default="humanoid", show_default=True, help="Body of the catalogue, or a body file.")
 @click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the set that has the labels]")
 @click.option("--height", type=_screen.HEIGHT, metavar="M", help="Height of the subject, barefoot [m].")
+@click.option("--mass", type=click.FloatRange(2, 700), metavar="KG", help="Mass of the subject.  [default: by height]")
 @click.option("--up", type=click.Choice(["x", "y", "z"]), help="Vertical axis.  [default: estimated]")
 @click.option("--sides", type=click.Choice(["labelled", "exchanged", "mirrored-x", "mirrored-y", "mirrored-z"]),
               help="How left and right are read: exchanged labels, a world with one axis negated, or as labelled "
@@ -203,8 +204,8 @@ Examples:
 @_screen.verbose_option
 def fit(
     take: Path, out: Path | None, subjects: tuple[Path, ...], static: Path | None, body: str, marker_set: str | None,
-    height: float | None, up: str | None, sides: str | None, limits: bool, smooth: bool, formats: str | None,
-    unit: str | None,
+    height: float | None, mass: float | None, up: str | None, sides: str | None, limits: bool, smooth: bool,
+    formats: str | None, unit: str | None,
 ) -> None:  # fmt: skip
     """Fit a body to markers: size and marker offsets from all frames, then joint angles."""
     from kinefit.cli._summary import print_files, print_summary
@@ -220,7 +221,7 @@ def fit(
             labelled, named, files = identify_file(take, list(subjects), target, unit=unit, step=step)
             source, unit = files["markers"], None
         known = Path(body) if Path(body).suffix else body
-        options = MarkerFitOptions(known, static, marker_set, height, up, limits, sides, smooth)
+        options = MarkerFitOptions(known, static, marker_set, height, up, limits, sides, smooth, mass)
         notes: list[Finding] = []
         found = fit_file(source, out, options, unit=unit, formats=chosen, step=step, notes=notes)
     if subjects:

@@ -61,30 +61,42 @@ def joint_plots(motion: Motion) -> dict[str, p.Html]:
     return out
 
 
-def cycle_plots(motion: Motion, cycles: Cycles, norms: Norms | None = None) -> dict[str, p.Html]:
-    """{joint: plot} of all coordinates over the cycle: mean, ±1 standard deviation, few cycles singly; norms behind."""
-    spans = {side.name: side.spans for side in cycles.sides}
-    other = next(iter(spans))  # of the middle of the body: the cycles of this side
-    marks = {s.name: float(np.nanmean(s.toe_off)) for s in cycles.sides if np.isfinite(s.toe_off).any()}
+def cycle_plots(trials: Sequence[tuple[Motion, Cycles]], norms: Norms | None = None) -> dict[str, p.Html]:
+    """{joint: plot} of all coordinates over the cycles of motions of one body, put together; norms behind.
+
+    Each with its mean, ±1 standard deviation, and, where they are few, single cycles.
+    """
+    sides = list(dict.fromkeys(side.name for _, cycles in trials for side in cycles.sides))
+    other = sides[0]  # of the middle of the body: the cycles of this side
+    every_side = [side for _, cycles in trials for side in cycles.sides]
+    toe_off = {name: np.concatenate([s.toe_off for s in every_side if s.name == name]) for name in sides}
+    marks = {name: float(np.nanmean(at)) for name, at in toe_off.items() if np.isfinite(at).any()}
+    every = [({c.name: c for c in curves(motion)}, cycles) for motion, cycles in trials]
+
+    def over_cycles(name: str, side: str) -> NDArray:
+        return np.concatenate([
+            normalised(of[name].values, s.spans) for of, cycles in every for s in cycles.sides if s.name == side
+        ])  # fmt: skip
+
     out = {}
-    found = [c for c in curves(motion) if not c.name.endswith(("_tx", "_tz"))]  # the way over ground is no cycle
+    found = [c for c in every[0][0].values() if not c.name.endswith(("_tx", "_tz"))]  # the way over ground is no cycle
     for joint, rows in by_joint(found).items():
         traces: list[dict] = []
         shown: dict[str, list[Curve]] = {}
-        for stem, sides in rows.items():
-            usable = [c for c in sides if c.side in spans or not c.side or "both" in spans]
+        for stem, found_sides in rows.items():
+            usable = [c for c in found_sides if c.side in sides or not c.side or "both" in sides]
             if not usable:
                 continue
             wanted = dict.fromkeys((*(c.name for c in usable), stem))
             for percent, mean, sd in (norms[name].T for name in wanted if norms and name in norms):
                 traces += p.band(percent, mean, sd, "norm", _GREY, len(shown))
             for curve in usable:
-                side = curve.side if curve.side in spans else other
-                values = normalised(curve.values, spans[side])
-                traces += _over_cycle(curve, values, len(shown), "" if side == "both" else side + " ")
+                side = curve.side if curve.side in sides else other
+                label = "" if side == "both" else side + " "
+                traces += _over_cycle(curve, over_cycles(curve.name, side), len(shown), label)
             shown[stem] = usable
         if shown:
-            of = {c.side or other for sides in shown.values() for c in sides}
+            of = {c.side or other for usable in shown.values() for c in usable}
             lines = [p.mark("x", at, _COLOURS[side], 1.2, "dash") for side, at in marks.items() if side in of]
             out[joint] = _stacked(traces, list(shown.values()), [None] * len(shown), "cycle [%]", marks=lines)
     return out

@@ -140,7 +140,7 @@ def find_gait(motion: Motion) -> Cycles | None:
             alike.append(float(np.mean([likeness(curves[..., c]) for c in range(len(columns))])))
         times = foot.contacts[np.searchsorted(frames, spans)]
         sides.append(Side(foot.side, spans, _toe_off(times, foot.offs), times))
-    if min(alike, default=1.0) < _MIN_CORRELATION or not _alternate(feet.left.contacts, feet.right.contacts):
+    if min(alike, default=1.0) < _MIN_CORRELATION or not take_turns(feet):
         return None
     return Cycles("gait", tuple(sides), float(np.mean(alike)) if alike else np.nan, feet) if sides else None
 
@@ -181,8 +181,14 @@ def _even(spans: NDArray) -> bool:
     return bool(np.std(durations) <= _EVEN * np.mean(durations))
 
 
-def _alternate(left: NDArray, right: NDArray) -> bool:
-    """Whether the feet take turns: between two strikes of one foot lies one of the other, nowhere near the ends."""
+def take_turns(feet: Feet) -> bool:
+    """Whether the feet take turns: between two strikes of one foot lies one of the other, nowhere near the ends.
+
+    A leg without its other one, which was not measured, does.
+    """
+    left, right = feet.left.contacts, feet.right.contacts
+    if not all(feet.observed):
+        return bool(len(left) or len(right))
     if not len(left) or not len(right):
         return False
     for one, other in ((left, right), (right, left)):

@@ -5,7 +5,7 @@ A foot swings where its heel goes from farthest behind the pelvis to farthest ah
 Gait & Posture 27:710-714). It stands where heel or ball are slow over the ground (as Ghoussayni et al. 2004, Gait &
 Posture 20:266-272, with a share of the swing's speed in place of 50 mm/s): contact is where the first of them falls
 below a share of its highest speed in the swing, toe-off where the ball rises above another. A treadmill's belt is
-ground, too: its velocity is that of what stands on it.
+ground, too: its velocity is that of what stands on it. Ahead is where the pelvis goes: of who walks backwards, behind.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ _ROUGH_STD_S = 0.05  # of the extreme place alone, which is 49 ms early
 _WAY_HZ, _SPEED_HZ = 6.0, 12.0  # what is faster is noise: walking has 99 % of its power below 6 Hz (Winter)
 _BEFORE_S, _AFTER_S = 0.1, 0.25  # [s] of the extreme place, within which the event is sought
 _LEAST_BELT = 0.15  # [m/s] of what stands: less is a floor
+_LEAST_BACK = 0.2  # [m/s] of a pelvis that moves backwards over the ground
+_MIN_SEEN_SHARE = 0.5  # of the frames in which a leg is measured; with less it has no events
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +57,15 @@ class Feet:
     ----------
     left, right : their events
     belt : (2,) [m/s] velocity of the ground along x and z of a world whose y is up: zero, or a treadmill's
+    observed : whether the left and the right leg were measured
+    backwards : whether the person walks backwards
     """
 
     left: FootEvents
     right: FootEvents
     belt: NDArray
+    observed: tuple[bool, bool] = (True, True)
+    backwards: bool = False
 
 
 def foot_events(motion: Motion) -> Feet | None:
@@ -78,11 +84,26 @@ def foot_events(motion: Motion) -> Feet | None:
     forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-9)
     ahead = np.einsum("fspi,fi->fsp", feet - hips.mean(axis=1)[:, None, None], forward)
     velocity = np.gradient(smoothed(feet, motion.rate, _SPEED_HZ), 1.0 / motion.rate, axis=0)[..., ::2]
-    belt = _belt(feet, velocity, hips.mean(axis=1)[:, ::2], motion.rate)
+    pelvis, observed = hips.mean(axis=1), _observed(motion)
+    measured = np.flatnonzero(observed)
+    belt = _belt(feet[:, measured], velocity[:, measured], pelvis[:, ::2], motion.rate)
     speed = np.linalg.norm(velocity - belt, axis=-1)
+    way = np.gradient(smoothed(pelvis, motion.rate), 1.0 / motion.rate, axis=0)[:, ::2] - belt
+    backwards = bool(np.median(np.sum(way * forward[:, ::2], axis=1)) < -_LEAST_BACK)
     least = LEAST_STEP * (motion.body.stature or 1.7)
+    ahead = (-ahead if backwards else ahead) * observed[:, None]  # of a leg that was not measured nothing is known
     left, right = (_events(motion, name, ahead[:, s], speed[:, s], least) for s, name in enumerate(("left", "right")))
-    return Feet(left, right, belt)
+    return Feet(left, right, belt, (bool(observed[0]), bool(observed[1])), backwards)
+
+
+def _observed(motion: Motion) -> NDArray:
+    """(2,) bool: whether the left and the right leg were measured, on the shank or the foot; both where neither was."""
+    marks, out = motion.body.landmarks, np.zeros(2, bool)
+    for s, side in enumerate("lr"):
+        foot = int(marks.segments[marks.index(f"{side}_{HEEL}")])
+        measured = motion.segment_quality[:, [foot, max(int(motion.body.tree.parents[foot]), 0)]] > 0.0
+        out[s] = measured.any(axis=1).mean() > _MIN_SEEN_SHARE
+    return out if out.any() else ~out
 
 
 def _belt(feet: NDArray, velocity: NDArray, pelvis: NDArray, rate: float) -> NDArray:
@@ -90,7 +111,7 @@ def _belt(feet: NDArray, velocity: NDArray, pelvis: NDArray, rate: float) -> NDA
 
     Parameters
     ----------
-    feet : (F, 2, 2, 3) [m] heels and balls, y up; velocity : (F, 2, 2, 2) [m/s] along x and z
+    feet : (F, 1 or 2, 2, 3) [m] heels and balls, y up; velocity : (F, 1 or 2, 2, 2) [m/s] along x and z
     pelvis : (F, 2) [m] along x and z; rate : float [Hz]
     """
     lower = np.argmin(feet[..., 1].mean(axis=2), axis=1)  # of two feet the one that stands

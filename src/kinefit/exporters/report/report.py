@@ -109,7 +109,7 @@ def write_report(
     date = date or datetime.date.today().isoformat()
     moments, throughout, shown = doubtful_moments(motion), throughout_sentence(motion), pictures or {}
     cycles = find_cycles(motion)
-    _check_norms(motion, norms, path)
+    check_norms(motion, norms, path)
     width = round(640 * min(1.0, (_BUDGET / max(1, sum(map(len, shown.values())))) ** 0.5))
     sections = [
         *p.fault_sections(of_provenance(motion.provenance)),
@@ -295,8 +295,8 @@ def _angles(motion: Motion) -> list[p.Html]:
     ]
 
 
-def _check_norms(motion: Motion, norms: Norms | None, path: str | PathLike[str]) -> None:
-    """Refuse normative values of coordinates that the body does not have."""
+def check_norms(motion: Motion, norms: Norms | None, path: str | PathLike[str]) -> None:
+    """Raise ExportError for normative values of coordinates that the body does not have."""
     stems = {name for c in curves(motion) for name in (c.name, c.stem)}
     unknown = [name for name in norms or {} if name not in stems]
     if unknown:
@@ -327,7 +327,7 @@ def _cycles(motion: Motion, cycles: Cycles | None, norms: Norms) -> list[p.Html]
     parts = [p.paragraph(text), gait_table(motion, cycles)]
     if norms:
         parts.append(p.paragraph("The grey band is the normative mean ±1 standard deviation of the table given."))
-    return [*parts, p.chooser("Joint", cycle_plots(motion, cycles, norms))]
+    return [*parts, p.chooser("Joint", cycle_plots([(motion, cycles)], norms))]
 
 
 def gait_table(motion: Motion, cycles: Cycles) -> p.Html:
@@ -335,16 +335,28 @@ def gait_table(motion: Motion, cycles: Cycles) -> p.Html:
     sides = [side.name for side in cycles.sides]
     heads = [head for side in sides for head in (f"{side}, mean ± 2 σ", "SD of cycles")]
     numbers = gait_numbers(motion, cycles)
-    rows = [(name, *(cell for of in each for cell in _cells(of))) for name, each in numbers.items()]
+    rows = [(name, *(cell for of in each for cell in cells(of))) for name, each in numbers.items()]
     return p.table(["", *heads], rows)
 
 
-def _cells(of: Quantity) -> tuple[str, str]:
+def cells(of: Quantity) -> tuple[str, str]:
+    """The mean with two standard deviations of its error, and how much single cycles differ."""
+    return value_and_error(of), f"{of.spread:.{_digits(of.mean)}f}" if np.isfinite(of.spread) else "–"
+
+
+def value_and_error(of: Quantity, sigmas: float = 2.0) -> str:
+    """The mean with so many standard deviations of its error."""
     if not np.isfinite(of.mean):
-        return "–", "–"
-    digits = max(0, 2 - int(np.floor(np.log10(max(abs(of.mean), 1e-9)))))  # three that count
-    error = f" ± {2.0 * of.std:.{digits}f}" if np.isfinite(of.std) else ", not observed"
-    return f"{of.mean:.{digits}f}{error}", f"{of.spread:.{digits}f}" if np.isfinite(of.spread) else "–"
+        return "–"
+    if not np.isfinite(of.std):
+        return f"{of.mean:.{_digits(of.mean)}f}, not observed"
+    digits = max(_digits(of.mean), _digits(sigmas * of.std, count=1))
+    return f"{of.mean:.{digits}f} ± {sigmas * of.std:.{digits}f}"
+
+
+def _digits(value: float, count: int = 3) -> int:
+    """Digits behind the point, of so many that count; six at most."""
+    return min(6, max(0, count - 1 - int(np.floor(np.log10(max(abs(value), 1e-9))))))
 
 
 def _fit(motion: Motion, moments: Sequence[Moment]) -> list[p.Html]:

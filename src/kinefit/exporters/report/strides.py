@@ -12,11 +12,12 @@ from kinefit.bodies import PointSet
 from kinefit.bodies.motion import BRIEF_S, Motion, rotation_between_up
 from kinefit.exporters.report.feet import BALL, HEEL, Feet, FootEvents
 
-_QUANTITIES = (
+QUANTITIES = (
     "stride time [s]", "cadence [steps/min]", "stance [% of cycle]", "swing [% of cycle]",
     "double support [% of cycle]", "step time [s]", "stride length [m]", "speed [m/s]",
     "step length [m]", "step width [m]", "foot progression [deg]",
 )  # fmt: skip
+"""Of a stride, in the order of tables."""
 
 _LEAST_SHARE = 0.3  # of the stature, of a stride that goes anywhere: shorter ones have no direction
 
@@ -70,18 +71,18 @@ def stride_quantities(motion: Motion, feet: Feet, side: str, times: NDArray) -> 
         progression is positive with the toes out.
     """
     own, other = (feet.left, feet.right) if side == "left" else (feet.right, feet.left)
-    rows = [_stride(motion, feet.belt, own, other, float(start), float(stop)) for start, stop in times]
-    table = {name: np.array([row.get(name, (np.nan, np.nan)) for row in rows]) for name in _QUANTITIES}
+    rows = [_stride(motion, feet, own, other, float(start), float(stop)) for start, stop in times]
+    table = {name: np.array([row.get(name, (np.nan, np.nan)) for row in rows]) for name in QUANTITIES}
     return {name: Quantity(*pairs.T) for name, pairs in table.items() if np.isfinite(pairs[:, 0]).any()}
 
 
 def _stride(
-    motion: Motion, belt: NDArray, own: FootEvents, other: FootEvents, start: float, stop: float
+    motion: Motion, feet: Feet, own: FootEvents, other: FootEvents, start: float, stop: float
 ) -> dict[str, tuple[float, float]]:
     """{name: (value, standard deviation)} of the stride between two contacts of a foot."""
     length = stop - start
-    ends = [own.contact_std[np.argmin(np.abs(own.contacts - t))] for t in (start, stop)]
-    std = float(np.hypot(*ends))
+    ends = [_std_at(own, t) for t in (start, stop)]
+    std = float(np.hypot(ends[0], ends[1]))
     out = {"stride time [s]": (length, std), "cadence [steps/min]": (120.0 / length, 120.0 * std / length**2)}
     first = _within(own.offs, own.off_std, start, stop)
     landed = _within(other.contacts, other.contact_std, start, stop)
@@ -95,11 +96,34 @@ def _stride(
         both = 100.0 * (last[0] - start + first[0] - landed[0]) / length
         error = 100.0 * float(np.linalg.norm([ends[0], last[1], first[1], landed[1]])) / length
         out["double support [% of cycle]"] = both, error
-    out |= _lengths(motion, belt, own.side[0], start, stop, landed and landed[0], first and first[0])
+    out |= _lengths(motion, feet, own.side[0], start, stop, landed and landed[0], first and first[0])
     if "stride length [m]" in out:
         gone, error = out["stride length [m]"]
         out["speed [m/s]"] = gone / length, float(np.hypot(error, std * gone / length) / length)
     return out
+
+
+def step_quantities(motion: Motion, feet: Feet, side: str, start: float, stop: float) -> dict[str, tuple[float, float]]:
+    """{name: (value, standard deviation)} of a single step between contacts: the other foot's, then this one's [s].
+
+    Its length is along the way of the pelvis in this time.
+    """
+    own, other = (feet.left, feet.right) if side == "left" else (feet.right, feet.left)
+    std = float(np.hypot(_std_at(other, start), _std_at(own, stop)))
+    out = {"step time [s]": (stop - start, std)}
+    ground, settled = _Ground(motion, feet.belt), _SETTLED * 2.0 * (stop - start)
+    begin, end = (ground.frame(t + settled) for t in (start, stop))
+    way = ground.sum_of([(f"{s}_hip", at, sign * 0.5) for s in "lr" for at, sign in ((end, 1.0), (begin, -1.0))])
+    if float(np.linalg.norm(way)) > 0.5 * _LEAST_SHARE * (motion.body.stature or 1.7):
+        along = way / np.linalg.norm(way)
+        step: list[Term] = [(f"{side[0]}_{HEEL}", end, 1.0), (f"{other.side[0]}_{HEEL}", begin, -1.0)]
+        out["step length [m]"] = float(ground.sum_of(step) @ along), ground.std_of(step, along)
+    return out
+
+
+def _std_at(foot: FootEvents, time: float) -> float:
+    """[s] of the contact nearest to a time."""
+    return float(foot.contact_std[np.argmin(np.abs(foot.contacts - time))])
 
 
 def _within(times: NDArray, stds: NDArray, start: float, stop: float) -> tuple[float, float] | None:
@@ -109,10 +133,10 @@ def _within(times: NDArray, stds: NDArray, start: float, stop: float) -> tuple[f
 
 
 def _lengths(
-    motion: Motion, belt: NDArray, side: str, start: float, stop: float, landed: float | None, off: float | None
+    motion: Motion, feet: Feet, side: str, start: float, stop: float, landed: float | None, off: float | None
 ) -> dict[str, tuple[float, float]]:
     """Of a stride of foot "l" or "r", in which the other one lands and this one leaves the ground at times [s]."""
-    ground, settled = _Ground(motion, belt), _SETTLED * (stop - start)
+    ground, settled = _Ground(motion, feet.belt), _SETTLED * (stop - start)
     begin, end = (ground.frame(t + settled) for t in (start, stop))
     heel, opposite = f"{side}_{HEEL}", f"{'r' if side == 'l' else 'l'}_{HEEL}"
     stride: list[Term] = [(heel, end, 1.0), (heel, begin, -1.0)]
@@ -121,7 +145,8 @@ def _lengths(
     if length < _LEAST_SHARE * (motion.body.stature or 1.7):
         return {}
     along = moved / length
-    right = np.array([-along[1], along[0]])  # y is up: of x ahead, z is to the right
+    facing = -along if feet.backwards else along
+    right = np.array([-facing[1], facing[0]])  # y is up: of x ahead, z is to the right
     out = {"stride length [m]": (length, ground.std_of(stride, along))}
     if landed is not None:
         at = ground.frame(landed + settled)
@@ -136,7 +161,7 @@ def _lengths(
         middle = ground.frame(0.5 * (start + off))
         foot: list[Term] = [*((f"{side}_{name}", middle, 0.5) for name in BALL), (heel, middle, -1.0)]
         axis, outward = ground.sum_of(foot), right if side == "r" else -right
-        turned, error = np.arctan2(axis @ outward, axis @ along), ground.turn_std_of(foot, outward, axis)
+        turned, error = np.arctan2(axis @ outward, axis @ facing), ground.turn_std_of(foot, outward, axis)
         out["foot progression [deg]"] = float(np.degrees(turned)), float(np.degrees(error))
     return out
 

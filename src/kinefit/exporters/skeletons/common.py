@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body
-from kinefit.bodies.joint_names import CHARACTER_BONES, segment_names
 from kinefit.bodies.motion import UP_AXES, Motion, continuous_quaternions, rotation_between_up
 from kinefit.bodies.rendering.looks import TubeMesh
+from kinefit.bodies.toml.joint_names import CHARACTER_BONES, segment_names
 from kinefit.errors import ExportError, check_choice, spelled
 from kinefit.geometry import se3
 

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit._files import write_bytes, write_lines
 from kinefit.bodies import Body
-from kinefit.bodies.joint_names import DIGITS, FINGERS, SIDES, humanoid_segments, joint_map
 from kinefit.bodies.motion import Motion, continuous_quaternions
+from kinefit.bodies.toml.joint_names import DIGITS, FINGERS, SIDES, humanoid_segments, joint_map
 from kinefit.errors import BodyError, ExportError, FileError
 from kinefit.exporters.skeletons.bvh import bvh_motion
 from kinefit.exporters.skeletons.common import euler

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import parse_toml, read_text
-from kinefit.bodies.joint_names import CHARACTER_BONES, ENDS, FINGERS, SEGMENTS, VRM0_FINGERS
 from kinefit.bodies.limbs import FACE
 from kinefit.bodies.motion import rotation_between_up
+from kinefit.bodies.toml.joint_names import CHARACTER_BONES, ENDS, FINGERS, SEGMENTS, VRM0_FINGERS
 from kinefit.errors import FileError, check_choice, names_file
 from kinefit.readers.skeletons.bvh import read_bvh
 from kinefit.readers.skeletons.common import text_of

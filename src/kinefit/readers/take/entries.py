@@ -42,6 +42,7 @@ _Reach = Annotated[float, Meta(ge=0, description="Give [near, far] in metres.")]
 _Place = Annotated[float, Meta(ge=0, lt=1, description="Give metres below 1: one farther off needs calibration.")]
 _Angle = Annotated[float, Meta(ge=0, lt=30, description="Give degrees below 30: one farther off needs calibration.")]
 _View = Annotated[float, Meta(ge=5, le=150, description="Give degrees from 5 to 150.")]
+_Mass = Annotated[float, Meta(gt=2, lt=700, description="Give the mass in kilograms, or remove it.")]
 _Stature = Annotated[float, Meta(gt=0.3, lt=3, description="Give the stature in metres, or remove it.")]
 _Disparity = Annotated[float, Meta(gt=0, lt=100, description="Give a positive number of pixels.")]
 _BandSigma = Annotated[float, Meta(gt=0, lt=1, description="Give the standard deviation of a band in metres: 0.005.")]
@@ -269,6 +270,8 @@ class TakeHead:
         Joints by elastic bands in place of hard ones, see `correspondences.bands.with_bands`; "all": all others.
     height : float [m] or None
         Stature of the person, as a first guess.
+    mass : float [kg] or None
+        Of the person: scales the masses of segments; None: about that of people of the stature.
     person : int, str or None
         The target person if several are in view, see `PersonChoice`; None: the one with most visible points.
     subject : Path or None
@@ -289,6 +292,7 @@ class TakeHead:
     body: str = "humanoid"
     bands: dict[str, _BandSigma] | None = None
     height: _Stature | None = None
+    mass: _Mass | None = None
     person: int | str | None = None
     subject: Path | None = None
     start: Path | None = None

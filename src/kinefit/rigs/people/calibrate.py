@@ -18,7 +18,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.lines import triangulate, triangulate_robust
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.rigs.people.first_rig import first_rig
-from kinefit.rigs.people.floor import centre_of_mass, settled
+from kinefit.rigs.people.floor import settled
 from kinefit.rigs.people.skeletons import first_cameras, in_step, steady_person
 from kinefit.rigs.refine.gauge import resized
 from kinefit.rigs.refine.refine import Length, check_input, length_of, prior_sigma, refine_from
@@ -227,6 +227,6 @@ def _on_the_floor(
     x = factor * seen.motion.positions()
     rig = settled(
         resized(rig, factor), x, factor * _above_soles(body, body.landmarks),
-        balance=factor * centre_of_mass(seen.motion), up=up,
+        balance=factor * seen.motion.centre_of_mass, up=up,
     )  # fmt: skip
     return rig, f"The floor is at height zero, {up} is up, the origin lies below the person's mean position; {rule}."

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.motion import Motion, rotation_between_up
+from kinefit.bodies.motion import rotation_between_up
 from kinefit.fitting.smoothing.foot_contacts import fit_plane, upward
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
@@ -14,10 +14,6 @@ _MAX_FOOT_HEIGHT_M = 0.12  # [m] points this little above the soles are the foot
 _FLAT = 0.02  # [m] how well a foot on the floor tells its height
 _STEPS = 20.0  # looks at the floor that are news, over a take
 _MAX_SUPPORT_DIFFERENCE_M = 0.03  # [m] the lower foot bears more than one this much higher
-_MASS = {
-    "pelvis": 0.142, "abdomen": 0.139, "thorax": 0.216, "head": 0.081, "upperarm": 0.028, "forearm": 0.016,
-    "hand": 0.006, "thigh": 0.100, "shank": 0.0465, "foot": 0.0145,
-}  # fmt: skip
 _STANCE_PERCENT = 20  # per cent of frames in which the lower foot surely stands
 
 
@@ -52,22 +48,6 @@ def settled(
     turn = se3.exp_so3(np.array([0.0, 0.0, -np.arctan2(towards[1], towards[0])]))
     T = se3.transform(turn @ R, turn @ -np.array([middle[0], middle[1], ground]))
     return rig.moved(se3.transform(rotation_between_up("z", up), np.zeros(3)) @ T)
-
-
-def centre_of_mass(motion: Motion) -> NDArray:
-    """(F, 3) [m] from the joint centres: each segment's mass midway between its own joint and the next.
-
-    Shares of the whole: W. Dempster, Space requirements of the seated operator, 1955, as in D. Winter, Biomechanics and
-    motor control of human movement, table 4.1. Segments of other names weigh nothing.
-    """
-    tree, joints = motion.body.tree, motion.segment_poses()[..., :3, 3]
-    total, out = 0.0, np.zeros((len(motion), 3))
-    for s, name in enumerate(tree.segments):
-        mass = _MASS.get(name.removesuffix("_l").removesuffix("_r"), 0.0)
-        below = [c for c in range(len(tree.segments)) if tree.parents[c] == s]
-        out += mass * (joints[:, s] + (joints[:, below[0]] if below else joints[:, s])) / 2.0
-        total += mass
-    return out / total if total > 0 else joints.mean(axis=1)
 
 
 def _upright(up: NDArray) -> NDArray:

@@ -127,6 +127,7 @@ class SeenRecord:
         lines = [_TAKE_HEAD, "", "[take]"]
         lines += [f"name = {quoted(take.name)}", f"rate = {self.rate:g}", f"up = {quoted(take.up)}"]
         lines += [f"body = {quoted(take.body)}"] + ([f"height = {take.height:g}"] if take.height else [])
+        lines += [f"mass = {take.mass:g}"] if take.mass else []
         lines += [] if self.alone else ["", "[calibration]", 'file = "calibration.toml"']
         for name in cameras:
             entry = next(e for e in take.cameras if e.name == name)

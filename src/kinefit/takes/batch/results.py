@@ -327,6 +327,8 @@ def provenance(take: Take, **more: Any) -> dict[str, Any]:
     ]  # fmt: skip
     if take.height:
         out["height"] = take.height
+    if take.mass:
+        out["mass"] = take.mass
     if take.session.stated:
         out["session"] = take.session.stated
     return out | more

@@ -85,9 +85,10 @@ class _ResultPage:
             ui.label(t("result.ranges_text")).classes("text-sm")
             columns = ("range_of", "left", "right", "middle", "difference")
             text_table([t(f"result.{key}") for key in columns], review.ranges)
-            if (report := review.folder / "report.html").is_file():
-                desk.files.folders.add(review.folder)
-                ui.link(t("take.report"), link("/file", path=report), new_tab=True)
+            for name in ("report", "gait"):
+                if (page := review.folder / f"{name}.html").is_file():
+                    desk.files.folders.add(review.folder)
+                    ui.link(t(f"take.{name}"), link("/file", path=page), new_tab=True)
         with card(t("result.angle")):
             names = {name: spoken(name) for name in motion.body.tree.coordinates}
             first = next((name for name in names if name.startswith("knee_angle")), next(iter(names)))

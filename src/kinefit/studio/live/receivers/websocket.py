@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from websockets.exceptions import ConnectionClosed
 
 from kinefit.bodies import Body
-from kinefit.bodies.joint_names import CHARACTER_BONES
 from kinefit.bodies.motion import rotation_between_up
+from kinefit.bodies.toml.joint_names import CHARACTER_BONES
 from kinefit.errors import BodyError, ExportError
 from kinefit.exporters.report.figure import live_figure
 from kinefit.exporters.report.page import inline_policy

@@ -49,10 +49,10 @@ def run() -> None:
     off: dict[tuple[str, str], list[tuple[float, float]]] = {}
     steps, records = list[float](), list[bool]()
     for name in (*PRINTED, *CHOSEN)[: amount(None, 1)]:
-        path = _file(name)
+        path = file_of(name)
         if path is None:
             continue
-        motion, markers = _fitted(path), read_markers(path)
+        motion, markers = fitted(path), read_markers(path)
         cycles = find_cycles(motion)
         records.append(cycles is not None and cycles.kind == "gait")
         if name in CHOSEN:
@@ -81,7 +81,8 @@ def _print(name: str, found: NDArray) -> None:
     figure(f"{name}_held", held, "% within 2 sigma", ">= 90", reason)
 
 
-def _file(name: str) -> Path | None:
+def file_of(name: str) -> Path | None:
+    """A walk by its name; None where the recordings are not there."""
     if name == "omcs":
         folder = data("gait_omcs")
         return None if folder is None else next(folder.glob("*.c3d"))
@@ -89,9 +90,11 @@ def _file(name: str) -> Path | None:
     return None if folder is None else folder / f"{name}.c3d"
 
 
-def _fitted(path: Path) -> Motion:
-    static = path.parent / "static.c3d"
-    options = ["--static", str(static)] if static.exists() else []
+def fitted(path: Path, mass: float | None = None) -> Motion:
+    """The motion of a file of markers, of a person of a mass [kg]."""
+    static = next((file for file in (path.parent / "static.c3d", path.parent / "static1.trc") if file.exists()), None)
+    options = ["--static", str(static)] if static else []
+    options += ["--mass", f"{mass}"] if mass else []
     with tempfile.TemporaryDirectory() as out:
         command = [sys.executable, "-m", "kinefit", "markers", "fit", str(path), "-o", out, "--formats", "motion"]
         subprocess.run([*command, *options], check=True, capture_output=True)
@@ -109,17 +112,11 @@ def _own(markers: Markers) -> list[Event]:
 
 def _plates(path: Path, markers: Markers) -> list[Event]:
     """Events by force plates under one foot."""
-    try:
-        import ezc3d
-    except ImportError:
-        return []
-    read = ezc3d.c3d(str(path), extract_forceplat_data=True)
-    rate = read["header"]["analogs"]["frame_rate"]
-    start, count = float(markers.times[0]), round(_PLATE_S * rate)
     out = []
-    for plate in read["data"]["platform"]:
-        force, centre = np.abs(np.array(plate["force"])[2]), 0.001 * np.array(plate["center_of_pressure"])
-        loaded = force - np.median(force[force < np.quantile(force, 0.3) + 5.0]) > _FORCE_N
+    for times, forces, centre in plates_of(path):
+        start, rate, force = float(times[0]), 1.0 / float(times[1] - times[0]), forces[2]
+        count = round(_PLATE_S * rate)
+        loaded = force > _FORCE_N
         for i in np.flatnonzero(np.diff(loaded.astype(int))):
             lands = bool(loaded[i + 1])
             stand = slice(i + 1, i + 1 + count) if lands else slice(max(i + 1 - count, 0), i + 1)
@@ -131,6 +128,23 @@ def _plates(path: Path, markers: Markers) -> list[Event]:
             foot = min(feet, key=lambda side: feet[side])
             if feet[foot] < _NEAR_M:
                 out.append(Event(foot, "contact" if lands else "off", time))
+    return out
+
+
+def plates_of(path: Path) -> list[tuple[NDArray, NDArray, NDArray]]:
+    """Of each plate of a file: times (N,) [s], force (3, N) [N] on the person, z up, and its centre (3, N) [m]."""
+    try:
+        import ezc3d
+    except ImportError:
+        return []
+    read, out = ezc3d.c3d(str(path), extract_forceplat_data=True), []
+    rate, start = read["header"]["analogs"]["frame_rate"], float(read_markers(path).times[0])
+    for plate in read["data"]["platform"]:
+        force = np.array(plate["force"])
+        force *= 1.0 if force[2].max() > -force[2].min() else -1.0
+        low = force[2] < np.quantile(force[2], 0.3) + 5.0
+        force -= np.median(force[:, low], axis=1, keepdims=True) * (np.median(force[2, low]) < _LOADED_N)
+        out.append((start + np.arange(force.shape[1]) / rate, force, 0.001 * np.array(plate["center_of_pressure"])))
     return out
 
 

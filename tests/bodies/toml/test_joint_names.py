@@ -3,7 +3,7 @@
 import pytest
 
 from kinefit.bodies import load_body
-from kinefit.bodies.joint_names import FINGERS, LIMBS, SIDES, conventions, find, joint_map, recorded_joints
+from kinefit.bodies.toml.joint_names import FINGERS, LIMBS, SIDES, conventions, find, joint_map, recorded_joints
 from kinefit.errors import BodyError, ObservationError
 
 BY_NAME = {family.name: family for family in conventions()}

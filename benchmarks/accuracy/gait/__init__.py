@@ -1,0 +1,1 @@
+"""Gait and movements, against force plates and the files of laboratories."""

@@ -1,0 +1,86 @@
+"""`kinefit gait`: the gait record of one person's walks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from kinefit.cli import _screen
+
+if TYPE_CHECKING:
+    from kinefit.exporters.gait.record import GaitRecord
+
+_CONTENTS = {
+    "csv": "all strides and steps", "parquet": "the same", "json": "means, symmetry, variability",
+    "page": "both sides on one page",
+}  # fmt: skip
+
+
+@click.command(short_help="Strides, steps and symmetry of a person's walks.", epilog="""\b
+Examples:
+  kinefit gait walk-kinefit
+  kinefit gait monday/*-kinefit --out monday/gait --report
+  kinefit gait walk-kinefit/motion.npz --report --reference adults.csv
+""")  # fmt: skip
+@click.argument("motions", metavar="MOTION...", nargs=-1, required=True, type=_screen.PATH)
+@click.option("-o", "--out", type=_screen.PATH, metavar="FOLDER", help="[default: the folder of the first MOTION]")
+@click.option("--report", is_flag=True, help="Write gait.html, too: both sides on one page.")
+@click.option(
+    "--reference", type=_screen.PATH, metavar="CSV",
+    help="With --report: bands behind the curves, with the columns coordinate, percent, mean and sd.",
+)
+@_screen.quiet_options
+@_screen.verbose_option
+def gait(motions: tuple[Path, ...], out: Path | None, report: bool, reference: Path | None, as_json: bool) -> None:
+    """Put the walks of one person together: fitted motions of `kinefit track` or `kinefit markers fit`.
+
+    Every number has its standard deviation. Single strides and steps count, those in turns apart from the others.
+    """
+    if reference is not None and not report:
+        raise click.UsageError("--reference needs --report: its bands stand on that page.")
+    from kinefit.exporters.gait.files import summary, write_gait
+    from kinefit.exporters.gait.page import write_gait_page
+    from kinefit.exporters.gait.record import gait_record
+    from kinefit.exporters.report.cycles import read_norms
+    from kinefit.readers.motion import find_motion, read_motion
+
+    files = list(dict.fromkeys(map(find_motion, motions)))
+    folder = out or files[0].parent
+    _screen.check_folder(folder)
+    norms = read_norms(reference) if reference else None
+    record = gait_record({_name(file, files): read_motion(file) for file in files})
+    written = write_gait(record, folder)
+    if report:
+        written["page"] = write_gait_page(record, folder / "gait.html", norms=norms)
+    if as_json:
+        _screen.print_json({**summary(record), "files": {name: str(path) for name, path in written.items()}})
+        return
+    _print(record)
+    for name, path in written.items():
+        _screen.say(f"{path}: {_CONTENTS[name]}")
+
+
+def _name(file: Path, files: list[Path]) -> str:
+    """Name of a trial: the folder of a motion.npz, else the file's; the whole path where another has the same."""
+    names = [one.resolve().parent.name if one.name == "motion.npz" else one.stem for one in files]
+    name = names[files.index(file)]
+    return name if names.count(name) == 1 else str(file)
+
+
+def _print(record: GaitRecord) -> None:
+    """Print the notes and a table of the record's walk."""
+    from kinefit.exporters.report.report import value_and_error
+
+    for note in record.notes:
+        _screen.note(note)
+    walk = record.walk
+    rows = []
+    for name, left, right, (share, std) in record.compared(walk):
+        each = [cell for found in (left, right) for cell in (value_and_error(found, 1.0), f"{len(found.values)}")]
+        rows.append([name, *each, f"{share:+.0f} ± {std:.0f}" if share == share else ""])
+    turned = sum(one.walk != walk for one in record.stretches)
+    _screen.print_table((f"{walk}, mean ± σ", "left", "n", "right", "n", "L−R [%]"), rows)
+    if turned:
+        _screen.say(f"{turned} strides and steps in turns are in the files alone.")
