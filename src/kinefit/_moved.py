@@ -11,7 +11,8 @@ from typing import Any
 
 MOVED = {
     "app": "studio.app", "assets": "readers.assets", "batch": "takes.batch", "batch.viewed": "studio.viewers.viewed",
-    "bodies.joint_names": "bodies.toml.joint_names", "bodies.anny": "bodies.morphs.anny", "bodies.body_surfaces": "bodies.surfaces.places", "calibration": "rigs",
+    "bodies.anny": "bodies.morphs.anny", "bodies.body_surfaces": "bodies.surfaces.places",
+    "bodies.joint_names": "bodies.toml.joint_names", "calibration": "rigs",
     "correspondences": "solving.correspondences", "diagnostics": "rigs.diagnostics",
     "diagnostics.sensors": "sensors.alignment", "diagnostics.views": "fitting.multiview.views",
     "evaluation": "simulation.evaluation", "frame": "fitting.frame", "identification": "markers",
@@ -25,8 +26,8 @@ MOVED = {
     "readers.sound": "readers.videos.sound", "readers.video": "readers.videos.video",
     "readers.video_files": "readers.videos.video_files", "recipes": "papers", "rendering": "bodies.rendering",
     "rows": "solving.rows", "serving": "studio.serving", "smoothing": "fitting.smoothing", "solvers": "solving",
-    "solvers.sequence": "solving.trajectory.sequence",
-    "subject": "fitting.subject", "tracking": "fitting.tracking", "viewers": "studio.viewers",
+    "solvers.sequence": "solving.trajectory.sequence", "subject": "fitting.subject", "tracking": "fitting.tracking",
+    "viewers": "studio.viewers",
 }  # fmt: skip
 """{path below `kinefit` in 0.2: path now}; what lies below a path moved with it."""
 
