@@ -3,8 +3,9 @@
 from importlib import import_module
 from importlib.util import find_spec
 
-import kinefit
 import pytest
+
+import kinefit
 from kinefit._moved import MOVED, moved
 
 

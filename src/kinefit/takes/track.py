@@ -107,7 +107,7 @@ def track_take(
             raise TrackingInterrupted(motion, stopped.total) from None
         except KinefitError as error:
             raise with_cause(error, findings) from error
-    motion = with_findings(motion, findings, seen, take.height)
+    motion = replace(with_findings(motion, findings, seen, take.height), plates=seen.plates)
     motion = on_floor(motion, recording, view.floors if view else [])
     if seen.rig is not None:
         seen = replace(seen, rig=rig_on_floor(as_found(seen.rig, motion.provenance), motion.provenance))

@@ -1,0 +1,1 @@
+"""Gait: events, strides, plates, the record of a person."""
