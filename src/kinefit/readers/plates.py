@@ -59,7 +59,7 @@ def read_plates(c3d: C3d, metres: float, up: str | None = None) -> PlatesRead:
             notes.append(f"force plate {k + 1} is of type {kind} and left out: types 1 to 4 are read")
             continue
         plate, said = _plate(c3d, k, kind, samples, metres, up)
-        plates += [plate] * (plate is not None)
+        plates += [] if plate is None else [plate]
         notes += [f"force plate {k + 1}: {text}" for text in said]
     return PlatesRead(tuple(plates), tuple(notes))
 

@@ -11,6 +11,9 @@ from kinefit._arguments import checked
 from kinefit.bodies import Body, load_body
 from kinefit.bodies.motion import Motion
 from kinefit.errors import KinefitError, TakeError, command, located
+from kinefit.exporters.gait.plates import plate_findings
+from kinefit.exporters.report.feet import foot_events
+from kinefit.findings import Finding
 from kinefit.fitting.smoothing.online.lag_frame import KnownNoise
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.subject.subject import Subject
@@ -107,11 +110,18 @@ def track_take(
             raise TrackingInterrupted(motion, stopped.total) from None
         except KinefitError as error:
             raise with_cause(error, findings) from error
-    motion = replace(with_findings(motion, findings, seen, take.height), plates=seen.plates)
+    motion = replace(motion, plates=seen.plates)
+    motion = with_findings(motion, (*findings, *_of_plates(motion)), seen, take.height)
     motion = on_floor(motion, recording, view.floors if view else [])
     if seen.rig is not None:
         seen = replace(seen, rig=rig_on_floor(as_found(seen.rig, motion.provenance), motion.provenance))
     return motion, seen
+
+
+def _of_plates(motion: Motion) -> list[Finding]:
+    """What is wrong with the force plates of a motion, by its feet."""
+    feet = foot_events(motion, plates=False) if motion.plates else None
+    return plate_findings(motion, [(f.contacts, f.offs) for f in (feet.left, feet.right)]) if feet else []
 
 
 def settings_of(take: Take, settings: TrackSettings | None = None) -> TrackSettings:

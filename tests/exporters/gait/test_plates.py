@@ -21,7 +21,7 @@ def walk(data_dir):
 
 
 def events_of(motion):
-    feet = foot_events(motion)
+    feet = foot_events(motion, plates=False)
     return [(foot.contacts, foot.offs) for foot in (feet.left, feet.right)]
 
 
