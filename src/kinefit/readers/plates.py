@@ -50,10 +50,19 @@ def read_plates(c3d: C3d, metres: float, up: str | None = None) -> PlatesRead:
         Channels or corners that the file does not have.
     """
     used = c3d.parameters.get("FORCE_PLATFORM:USED")
-    count = int(used.flat[0]) if isinstance(used, np.ndarray) and used.size else 0
-    samples = _samples(c3d) if count > 0 else np.zeros((0, 0))
-    plates, notes = list[ForcePlate](), list[str]()
-    for k in range(count if len(samples) else 0):
+    try:
+        count = int(used.flat[0]) if isinstance(used, np.ndarray) and used.size else 0
+        with np.errstate(all="ignore"):  # what a damaged file then has is left out
+            return _read(c3d, count if c3d.analog.size else 0, metres, up)
+    except (IndexError, ValueError, TypeError, OverflowError) as error:
+        remedy = "Correct the groups FORCE_PLATFORM and ANALOG in a C3D editor such as Mokka."
+        raise FileError(f"parameters do not fit together ({error})", place="FORCE_PLATFORM", remedy=remedy) from error
+
+
+def _read(c3d: C3d, count: int, metres: float, up: str | None) -> PlatesRead:
+    """So many plates."""
+    plates, notes, samples = list[ForcePlate](), list[str](), _samples(c3d) if count > 0 else np.zeros((0, 0))
+    for k in range(count):
         kind = int(_of(c3d, "TYPE", k))
         if kind not in _CHANNELS:
             notes.append(f"force plate {k + 1} is of type {kind} and left out: types 1 to 4 are read")
@@ -84,9 +93,9 @@ def _samples(c3d: C3d) -> NDArray:
         numbers["OFFSET"] = np.mod(offset.astype(float), 65536.0) if isinstance(offset, np.ndarray) else offset
     each = {
         key: np.resize(value.astype(float), channels) if isinstance(value, np.ndarray) and value.size else blank
-        for (key, value), blank in zip(numbers.items(), (np.ones(channels), np.zeros(channels), np.ones(1)))
+        for (key, value), blank in zip(numbers.items(), (1.0, 0.0, 1.0))
     }
-    return (raw - each["OFFSET"]) * each["SCALE"] * each["GEN_SCALE"][0]
+    return (raw - each["OFFSET"]) * each["SCALE"] * each["GEN_SCALE"]
 
 
 def _plate(
@@ -112,6 +121,8 @@ def _plate(
     placed = lambda values: _placed(kind, values, _of(c3d, "ORIGIN", k), metres, corners, up)
     rate, start = c3d.rate * c3d.samples, (c3d.first_frame - 1) / c3d.rate
     plate = ForcePlate(f"plate {k + 1}", corners, rate, start, *placed(values))
+    if not (np.isfinite(plate.force).all() and np.isfinite(plate.moment).all()):
+        return None, ["left out: its forces are not finite"]
     if share_inside(plate) < _OUTSIDE:
         for factor in _FACTORS if kind in (2, 4) else ():
             other = replace(plate, moment=placed(values * np.repeat([1.0, factor], 3))[1])
