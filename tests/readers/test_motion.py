@@ -12,6 +12,7 @@ from kinefit.bodies.motion import ARRAYS, Residuals
 from kinefit.bodies.serial import body_from_arrays, body_to_arrays
 from kinefit.errors import BodyError, ExportError, FileError
 from kinefit.exporters import write_motion
+from kinefit.geometry.force_plates import ForcePlate
 from kinefit.readers.motion import read_motion
 
 
@@ -35,7 +36,9 @@ def written(tmp_path):
     factors = np.random.default_rng(0).standard_normal((2, 4, motion.dof_std.shape[1], 3)).astype(np.float16)
     square = np.random.default_rng(1).standard_normal((2, 2, 2))
     known = ParameterErrors(("thigh", "cam0 tx 1a2b"), np.array([1.0, 0.01]), *square, square[0].repeat(2, axis=0)[:3])
-    motion = replace(motion, lasting=LastingErrors(np.array([0, 5, 10, 14]), *factors, 0.3, known))
+    wrench = np.random.default_rng(2).standard_normal((2, 30, 3))
+    plate = ForcePlate("plate 1/a", np.array([[1.0, 1, 0], [0, 1, 0], [0, 0, 0], [1, 0, 0]]), 1000.0, 0.25, *wrench)
+    motion = replace(motion, lasting=LastingErrors(np.array([0, 5, 10, 14]), *factors, 0.3, known), plates=(plate,))
     write_motion(motion, tmp_path / "a.npz")
     return motion, tmp_path / "a.npz"
 
@@ -43,11 +46,13 @@ def written(tmp_path):
 def test_everything_comes_back_exactly(written):
     motion, path = written
     back = read_motion(path)
-    assert len(fields(motion)) == len(ARRAYS) + 7  # whoever adds one to a motion adds it to its file
+    assert len(fields(motion)) == len(ARRAYS) + 8  # whoever adds one to a motion adds it to its file
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(back, name), getattr(motion, name), strict=True)
     assert (back.rate, back.up, back.name) == (motion.rate, motion.up, motion.name)
     assert back.provenance == motion.provenance
+    for field in fields(ForcePlate):
+        np.testing.assert_array_equal(getattr(back.plates[0], field.name), getattr(motion.plates[0], field.name))
     assert list(back.residuals) == list(motion.residuals) == ["cam 0", "cam 1", "markers/1"]
     for sensor, r in motion.residuals.items():
         for field in fields(Residuals):

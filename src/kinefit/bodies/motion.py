@@ -17,6 +17,7 @@ from kinefit.bodies.masses import segment_masses
 from kinefit.bodies.tree import BodyState
 from kinefit.errors import ExportError, ObservationError, check_choice
 from kinefit.geometry import se3
+from kinefit.geometry.force_plates import ForcePlate
 
 UP_AXES = {
     "x": (1.0, 0.0, 0.0),
@@ -168,6 +169,7 @@ class Motion:
         What was done with which settings, in numbers, texts, lists and mappings (as JSON has them).
     lasting : LastingErrors
         Errors that frames have in common, see `std_of`; None where unknown.
+    plates : force plates that were recorded with it, in its world and by its clock
     """
 
     body: Body
@@ -184,6 +186,7 @@ class Motion:
     name: str = "motion"
     provenance: Mapping[str, Any] = field(default_factory=dict)
     lasting: LastingErrors | None = None
+    plates: tuple[ForcePlate, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ARRAYS:
@@ -367,7 +370,7 @@ class Motion:
         return replace(
             self, Ts_world_root=roots, joint_std=_turned_std(self.joint_std, R, rays), residuals=residuals,
             dof_std=np.concatenate([shift, turn, self.dof_std[:, 6:]], axis=1),
-            lasting=self.lasting and self.lasting.turned(R),
+            lasting=self.lasting and self.lasting.turned(R), plates=tuple(p.moved(T_new_world) for p in self.plates),
         )  # fmt: skip
 
     def turned(self, up: str) -> Motion:
@@ -389,6 +392,7 @@ class Motion:
             residuals=residuals,
             up=up,
             lasting=self.lasting and self.lasting.turned(R),
+            plates=tuple(plate.moved(T) for plate in self.plates),
         )
 
 

@@ -3,7 +3,7 @@
 from kinefit.exporters.c3d_file import write_c3d, write_markers
 from kinefit.exporters.interchange import write_mcap, write_nwb, write_rrd
 from kinefit.exporters.motion_file import write_jsonl, write_motion
-from kinefit.exporters.opensim import write_mot, write_osim, write_trc
+from kinefit.exporters.opensim import write_forces, write_mot, write_osim, write_trc
 from kinefit.exporters.pictures.overlay import (
     depth_picture,
     draw_overlay,
@@ -20,7 +20,7 @@ from kinefit.exporters.tables import tables, write_csv, write_parquet
 
 __all__ = [
     "depth_picture", "draw_overlay", "tables", "write_bvh", "write_c3d", "write_character", "write_csv",
-    "write_depth_overlay", "write_fbx", "write_glb", "write_jsonl", "write_markers", "write_mcap", "write_montage",
-    "write_mot", "write_motion", "write_nwb", "write_osim", "write_overlay", "write_parquet", "write_report",
-    "write_rrd", "write_trc", "write_usd", "write_x3d",
+    "write_depth_overlay", "write_fbx", "write_forces", "write_glb", "write_jsonl", "write_markers", "write_mcap",
+    "write_montage", "write_mot", "write_motion", "write_nwb", "write_osim", "write_overlay", "write_parquet",
+    "write_report", "write_rrd", "write_trc", "write_usd", "write_x3d",
 ]  # fmt: skip

@@ -137,7 +137,8 @@ def write_c3d(
     Centres and landmarks are there in all frames, with residual 0: computed, not measured. Angles are points that
     POINT:ANGLES lists, as laboratories' programs expect them: the coordinates of a joint in degrees as x, y and z, as
     `LHipAngles`; missing in frames in which none of them is observed. The first frame's number follows from its time,
-    frame 1 being at 0 s. Contacts and toe-offs of a walk are EVENTs, "Foot Strike" and "Foot Off".
+    frame 1 being at 0 s. Contacts and toe-offs of a walk are EVENTs, "Foot Strike" and "Foot Off". Force plates are
+    analog channels and FORCE_PLATFORM, of type 2.
 
     Parameters
     ----------
@@ -184,7 +185,40 @@ def write_c3d(
     }  # fmt: skip
     if gait := find_gait(motion):
         groups["EVENT"] = _events(gait.events)
-    write_bytes(path, c3d_bytes(points, fourth, groups, scale=-1.0, rate=motion.rate, first=first))
+    analog, samples = None, 1
+    if world.plates:
+        groups["ANALOG"], groups["FORCE_PLATFORM"], analog, samples = _plates(world, unit, factor)
+    whole = c3d_bytes(
+        points, fourth, groups, scale=-1.0, rate=motion.rate, first=first, analog=analog, samples=samples
+    )
+    write_bytes(path, whole)
+
+
+def _plates(motion: Motion, unit: str, factor: float) -> tuple[dict[str, Value], dict[str, Value], NDArray, int]:
+    """Groups ANALOG and FORCE_PLATFORM of plates as type 2, samples (F, C) of every frame, and how many a frame."""
+    samples = max(round(max(plate.rate for plate in motion.plates) / motion.rate), 1)
+    times = motion.times[0] + np.arange(len(motion) * samples) / (motion.rate * samples)
+    columns, labels, corners = list[NDArray](), list[str](), list[NDArray]()
+    for k, plate in enumerate(motion.plates, 1):
+        axes = np.vstack([plate.axes, np.cross(*plate.axes)])
+        on_plate = np.concatenate([-plate.force @ axes.T, -factor * plate.moment @ axes.T], axis=1)
+        columns += [np.interp(times, plate.times, c, 0.0, 0.0) for c in on_plate.T]
+        labels += [f"{kind}{axis}{k}" for kind in ("Force.F", "Moment.M") for axis in "xyz"]
+        corners.append(factor * plate.corners.T)
+    count, channels = len(motion.plates), len(labels)
+    analog: dict[str, Value] = {
+        "USED": np.array(channels, np.uint16), "RATE": np.array(motion.rate * samples, np.float32),
+        "SCALE": np.ones(channels, np.float32), "OFFSET": np.zeros(channels, np.int16),
+        "GEN_SCALE": np.array(1.0, np.float32), "UNITS": (["N"] * 3 + [f"N{unit}"] * 3) * count,
+        **label_groups(labels, ["force plate"] * channels),
+    }  # fmt: skip
+    platform: dict[str, Value] = {
+        "USED": np.array(count, np.uint16), "TYPE": np.full(count, 2, np.uint16), "ZERO": np.zeros(2, np.uint16),
+        "CORNERS": np.stack(corners, axis=-1).astype(np.float32), "ORIGIN": np.zeros((3, count), np.float32),
+        "CHANNEL": np.arange(1, channels + 1, dtype=np.uint16).reshape(6, count, order="F"),
+    }  # fmt: skip
+    table = np.column_stack(columns).reshape(len(motion), samples * channels)
+    return analog, platform, table, samples
 
 
 def _angles(motion: Motion) -> dict[str, list[Curve]]:

@@ -47,6 +47,8 @@ def write_motion(motion: Motion, path: str | PathLike[str]) -> None:
     for sensor, residuals in motion.residuals.items():
         shapes = form.RESIDUAL_SHAPES | form.SURFACE_SHAPES
         arrays |= arrays_of(residuals, shapes, f"residuals/{quote(sensor, safe='')}/")
+    for plate in motion.plates:
+        arrays |= arrays_of(plate, form.PLATE_SHAPES, f"plates/{quote(plate.name, safe='')}/")
     _write(path, "a motion file", form, arrays)
 
 

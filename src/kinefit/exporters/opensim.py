@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import chain, count
 from os import PathLike
 from pathlib import Path
@@ -237,6 +238,36 @@ def write_mot(motion: Motion, path: str | PathLike[str]) -> None:
             yield from (row % tuple(values) for values in table.tolist())
 
     write_lines(path, chain(lines, rows()))
+
+
+@checked
+def write_forces(motion: Motion, path: str | PathLike[str]) -> None:
+    """Write what force plates measured as ground forces of OpenSim, y up: `ground_force_1_vx` and so on.
+
+    Force [N], centre of pressure [m] and free moment [N m] of each plate, zero where nobody stands on it, at the rate
+    of the first plate.
+
+    Raises
+    ------
+    ExportError
+        No plate was recorded, or the file cannot be written.
+    """
+    if not motion.plates:
+        remedy = "Name the C3D of the trial in [[markers]], or its forces in [[plate]]."
+        raise ExportError("this motion has no force plates", file=path, remedy=remedy)
+    upright = replace(next(motion.parts(1)), plates=motion.plates).turned("y").plates
+    times = upright[0].times
+    names, columns = ["time"], [times]
+    for k, plate in enumerate(upright, 1):
+        names += [f"ground_force_{k}_{kind}{axis}" for kind in "vp" for axis in "xyz"]
+        names += [f"ground_torque_{k}_{axis}" for axis in "xyz"]
+        at, turning = plate.centre_of_pressure(), plate.free_moment()[:, None] * plate.normal
+        table = np.concatenate([np.where(np.isfinite(at), plate.force, 0.0), at, turning], axis=1)
+        columns += [np.interp(times, plate.times, c, 0.0, 0.0) for c in np.nan_to_num(table).T]
+    head = [motion.name.replace("\n", " "), "version=1", f"nRows={len(times)}", f"nColumns={len(names)}"]
+    head += ["inDegrees=yes", "endheader", "\t".join(names)]
+    row = "\t".join(["%.9f"] + ["%.6f"] * (len(names) - 1))
+    write_lines(path, chain(head, (row % tuple(values) for values in (np.column_stack(columns) + 0.0).tolist())))
 
 
 @checked

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
+from kinefit.geometry.force_plates import ForcePlate
 from kinefit.observations.arrays import check_seen, freeze, frozen, sealed
 
 _MAX_SCORE = 20.0  # heatmaps of OpenPose and HRNet reach 1.4, the SimCC heads of RTMW about 10, percentages 50 and more
@@ -255,6 +256,7 @@ class Markers:
         of `first_frame`, where frame 1 is at 0 s, as in C3D.
     notes : tuple of str
         What the reader decided where the file contradicts itself, and what it lacks.
+    plates : force plates of the recording, in the world and by the clock of the markers
 
     Raises
     ------
@@ -273,6 +275,7 @@ class Markers:
     events: tuple[MarkerEvent, ...] = ()
     first_time: float = np.nan
     notes: tuple[str, ...] = ()
+    plates: tuple[ForcePlate, ...] = ()
 
     def __post_init__(self) -> None:
         check_seen(self.source, self.rate, self.names)

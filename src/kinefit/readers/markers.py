@@ -15,6 +15,7 @@ from kinefit._files import metres_of, read_bytes
 from kinefit.errors import FileError, ObservationError, names_file, shortened
 from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
+from kinefit.readers.plates import PlatesRead, read_plates
 from kinefit.readers.plugins import MARKERS, FileFormat
 
 _MAX_NEAR_ORIGIN = 0.01  # [m] from the origin, of a person in metres that are read as millimetres
@@ -137,11 +138,16 @@ def _read_c3d(path: Path, unit: str | None) -> Markers:
     if c3d.missing[:, keep].all():
         raise _unseen(len(keep), len(c3d.points))
     positions = np.where(c3d.missing[..., None], np.nan, c3d.points) * metres
+    up = screen if screen in ("x", "y", "z") else None
+    try:
+        forces = read_plates(c3d, metres, up)
+    except FileError as error:  # the markers are good all the same
+        forces = PlatesRead((), (f"force plates are left out: {error.problem}",))
     return Markers(
         tuple(_unique(labels)[i] for i in keep), c3d.rate, positions[:, keep], residual=c3d.residual[:, keep] * metres,
-        up=screen if screen in ("x", "y", "z") else None, first_frame=c3d.first_frame, source=str(path),
+        up=up, first_frame=c3d.first_frame, source=str(path),
         unit=str(unit).strip().lower(), events=_events(c3d),
-        notes=tuple(f"{path.name}: {note}" for note in c3d.notes),
+        notes=tuple(f"{path.name}: {note}" for note in (*c3d.notes, *forces.notes)), plates=forces.plates,
     )
 
 

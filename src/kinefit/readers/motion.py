@@ -21,6 +21,7 @@ F frames, S segments, D coordinates; metres, radians, seconds, pixels; float64 u
     residuals/SENSOR/unit ()         "px" or "m"
     residuals/SENSOR/values (F, K, N)                 measured minus fitted, NaN if unobserved; N = 2 or 3
     residuals/SENSOR/measured (F, K, N)  weights (F, K)
+    plates/NAME/corners (4, 3)  rate ()  first_time ()  force (n, 3)  moment (n, 3)     [m, Hz, s, N, N m]
     residuals/SENSOR/swapped (F,)    bool, the detector swapped left and right, corrected
 
 Sensor names are percent-encoded in keys.
@@ -42,6 +43,7 @@ from kinefit.bodies.lasting_errors import LastingErrors, ParameterErrors
 from kinefit.bodies.motion import Motion, Residuals
 from kinefit.bodies.serial import below, body_from_arrays, fields_of, prefixes
 from kinefit.errors import FileError, KinefitError, command
+from kinefit.geometry.force_plates import ForcePlate
 
 FORMAT, VERSION = "kinefit motion", 1
 SHAPES = {
@@ -56,6 +58,7 @@ LASTING_SHAPES = {"frames": "K<F", "constant": "K N C!", "drift": "K N d!", "dri
 PARAMETER_SHAPES = {
     "names": "P$", "values": "P!", "covariance": "P P!", "information": "P P!", "directions": "C P!",
 }  # fmt: skip
+PLATE_SHAPES = {"corners": "4 3!", "rate": "", "first_time": "", "force": "n 3", "moment": "n 3"}
 SURFACE_SHAPES = {"rms": "F k", "count": "F k"}
 _REMEDY = "Write it again with kinefit, or copy it again from its source."
 
@@ -140,7 +143,9 @@ def _motion(arrays: Mapping[str, NDArray]) -> Motion:
     if lasting is not None and "lasting/parameters/names" in arrays:
         known = ParameterErrors(**fields_of(arrays, PARAMETER_SHAPES, sizes, "lasting/parameters/"))
         lasting = replace(lasting, parameters=known)
-    return Motion(body=body, **own, residuals=residuals, provenance=provenance, lasting=lasting)
+    found = prefixes(arrays, "plates").items()
+    plates = tuple(ForcePlate(name, **fields_of(arrays, PLATE_SHAPES, sizes, prefix)) for name, prefix in found)
+    return Motion(body=body, **own, residuals=residuals, provenance=provenance, lasting=lasting, plates=plates)
 
 
 def _residuals(arrays: Mapping[str, NDArray], prefix: str, sizes: dict[str, int]) -> Residuals:

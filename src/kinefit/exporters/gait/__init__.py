@@ -1,1 +1,1 @@
-"""The gait record: strides and steps of one person's walks put together, as tables and as a page."""
+"""Gait: feet on plates, and the record of strides and steps of one person's walks, as tables and as a page."""

@@ -10,12 +10,14 @@ ground, too: its velocity is that of what stands on it. Ahead is where the pelvi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.motion import Motion, rotation_between_up
+from kinefit.exporters.gait.plates import Footfall, by_plates, footfalls
 
 LEAST_STEP = 0.12  # share of the stature that a foot travels to and fro at least: shuffling 20 cm strides of an adult
 MIN_STRIDE_S = 0.4  # [s]: sprinters take 0.45 s
@@ -68,10 +70,11 @@ class Feet:
     backwards: bool = False
 
 
-def foot_events(motion: Motion) -> Feet | None:
+def foot_events(motion: Motion, *, plates: bool = True) -> Feet | None:
     """Events of the left and of the right foot; None where the body has no heels, balls of the feet or hips.
 
-    Steps that are shorter than 12 % of the stature are left out, and what is next to the ends of the motion.
+    What force plates measured counts in place of what the feet show; with `plates` false it is left aside. Steps that
+    are shorter than 12 % of the stature are left out, and what is next to the ends of the motion.
     """
     names = [f"{s}_{n}" for s in "lr" for n in ("hip", HEEL, *BALL)]
     if any(name not in motion.body.landmarks.names for name in names) or len(motion) < 3:
@@ -93,7 +96,15 @@ def foot_events(motion: Motion) -> Feet | None:
     least = LEAST_STEP * (motion.body.stature or 1.7)
     ahead = (-ahead if backwards else ahead) * observed[:, None]  # of a leg that was not measured nothing is known
     left, right = (_events(motion, name, ahead[:, s], speed[:, s], least) for s, name in enumerate(("left", "right")))
-    return Feet(left, right, belt, (bool(observed[0]), bool(observed[1])), backwards)
+    steps = footfalls(motion) if plates else []
+    sides = (_with_plates(left, steps), _with_plates(right, steps))
+    return Feet(*sides, belt, (bool(observed[0]), bool(observed[1])), backwards)
+
+
+def _with_plates(foot: FootEvents, steps: Sequence[Footfall]) -> FootEvents:
+    """Events of a foot, with those of plates in place of its own."""
+    contacts, contact_std = by_plates(steps, foot.side, "contact", foot.contacts, foot.contact_std)
+    return FootEvents(foot.side, contacts, contact_std, *by_plates(steps, foot.side, "off", foot.offs, foot.off_std))
 
 
 def _observed(motion: Motion) -> NDArray:

@@ -154,7 +154,7 @@ def motion_of(
     provenance["estimate"] = "smoothed" if smooth else alone if lag is None else "fixed lag"
     return Motion(
         body=body, rate=rate, times=frames.times, **_arrays(last, body, len(results)), residuals=residuals, up=up,
-        name=name, provenance=provenance, lasting=lasting,
+        name=name, provenance=provenance, lasting=lasting, plates=(),
     )  # fmt: skip
 
 

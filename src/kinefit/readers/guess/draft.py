@@ -14,7 +14,7 @@ from kinefit.readers.guess.files import CalibrationFile
 CONFIDENCE_LEVELS = ("sure", "likely", "guess", "open")
 """From "stated by the files" to "the user decides"."""
 
-_TABLES = ("keypoints", "depth", "markers")  # in the order in which they are written
+_TABLES = ("keypoints", "depth", "markers", "plate")  # in the order in which they are written
 _COMMENT_COLUMN = 40
 _HEAD = """\
 # A first take file, made by kinefit init from what lies in the folder.

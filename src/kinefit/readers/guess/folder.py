@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -21,6 +22,7 @@ from kinefit.readers.guess.draft import Draft, Entry, Note, Value
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile
 from kinefit.readers.guess.names import COUNTED, later_chapters, trials
 from kinefit.readers.markers import read_markers
+from kinefit.readers.plates import read_force_file
 from kinefit.readers.ros.images import Shown, mcap_rig, shown
 from kinefit.readers.take.entries import TABLES
 from kinefit.readers.take.kinds import KINDS, Proposal
@@ -98,7 +100,8 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
             describe_cameras(draft, calibration, videos, keypoints)
     if recordings:
         describe_recordings(draft, recordings, alone=not (videos or keypoints or markers))
-    _describe_markers(draft, markers)
+    used = _describe_markers(draft, markers)
+    _describe_plates(draft, files, used)
     draft.comments.append(OPEN_HEIGHT)
     return Guess(draft.text(), tuple(draft.notes))
 
@@ -263,8 +266,11 @@ def _above(folder: Path) -> list[Path]:
     return out
 
 
-def _describe_markers(draft: Draft, files: Sequence[Path]) -> None:
-    """Enter marker files: in use without cameras, else as comments (they may be another program's results)."""
+def _describe_markers(draft: Draft, files: Sequence[Path]) -> Path | None:
+    """Enter marker files: in use without cameras, else as comments (they may be another program's results).
+
+    Returns the file in use.
+    """
     faults: list[KinefitError] = []
     records = {}
     for path in files:
@@ -301,6 +307,25 @@ def _describe_markers(draft: Draft, files: Sequence[Path]) -> None:
     if left:
         reason = "results of other programs, or" if draft.cameras else ""
         draft.note("markers", "guess", f"{left} files are comments: {reason} other recordings".replace("  ", " "))
+    plates = records[used].plates if used is not None else ()
+    if plates:
+        draft.note("plates", "sure", f"{len(plates)} force plates come with {draft.name(used or draft.folder)}")
+    return None if plates else used
+
+
+def _describe_plates(draft: Draft, files: Sequence[Path], markers: Path | None) -> None:
+    """Enter ground forces beside the markers in use, where their file has none: of the same name, or the only ones."""
+    forces = {}
+    for path in files if markers is not None else ():
+        if path.suffix.lower() in (".mot", ".sto"):
+            with suppress(KinefitError):  # a table of angles
+                forces[path] = read_force_file(path).plates
+    named = [path for path in forces if markers is not None and path.stem.startswith(markers.stem)]
+    for path, plates in forces.items():
+        is_used = path in (named or list(forces))[: 1 if named or len(forces) == 1 else 0]
+        file = Value(path, "likely", f"{len(plates)} force plates, {plates[0].rate:g} Hz, y up")
+        draft.tables["plate"].append((is_used, {"file": file}))
+        draft.note("plates", "likely", f"{draft.name(path)}: ground forces{'' if is_used else ', as a comment'}")
 
 
 _ALIGNED = "aligned"  # in the name of a topic with the same depth, warped to another camera

@@ -169,12 +169,11 @@ class KeypointsEntry(TakeEntry, frozen=True, kw_only=True):
                 refuse(getattr(self, key), f"'{key}' has no use with a stream", "Leave it out.")
 
 
-class PlacedEntry(TakeEntry, frozen=True, kw_only=True):
-    """A file of places in a world of its own."""
+class PlateEntry(TakeEntry, frozen=True, kw_only=True):
+    """`[[plate]]`: force plates in a file of their own; those of a C3D that `[[markers]]` names come with it."""
 
-    file: Path
+    file: Path  # .c3d, or .mot of OpenSim
     time_offset: Seconds = 0.0  # [s]
-    sigma: Metres = 0.005  # [m] standard deviation
     shift: tuple[_Shift, _Shift, _Shift] = (0.0, 0.0, 0.0)  # [m] of the file's origin, in the world
     turn: tuple[_Turn, _Turn, _Turn] = (0.0, 0.0, 0.0)  # [deg] rotation vector, from the file's axes to the world's
 
@@ -182,6 +181,12 @@ class PlacedEntry(TakeEntry, frozen=True, kw_only=True):
     def T_world_file(self) -> NDArray:
         """(4, 4) [m] from the frame of the file to the world."""
         return se3.transform(se3.exp_so3(np.radians(self.turn)), np.array(self.shift))
+
+
+class PlacedEntry(PlateEntry, frozen=True, kw_only=True):
+    """A file of places in a world of its own."""
+
+    sigma: Metres = 0.005  # [m] standard deviation
 
 
 class MarkersEntry(PlacedEntry, frozen=True, kw_only=True):
@@ -328,6 +333,7 @@ class Take(TakeHead):
     calibration : CalibrationEntry or None
     cameras, keypoints, markers, depth, stereo, skin : tuples
         Of entries; `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
+    plates : tuple of PlateEntry
     sensors : {table: entries} of all other kinds, see `SensorKind`
     digest : str
         SHA-256 of the file's tables as they are written, without comments and spacing; "" for a take of no file.
@@ -344,6 +350,7 @@ class Take(TakeHead):
     depth: tuple[DepthEntry, ...] = ()
     stereo: tuple[StereoEntry, ...] = ()
     skin: tuple[KeypointsEntry, ...] = ()
+    plates: tuple[PlateEntry, ...] = ()
     sensors: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -375,8 +382,8 @@ class Take(TakeHead):
     @property
     def other_sensors(self) -> tuple[object, ...]:
         """Entries of all sensors but cameras and the keypoints of a detector."""
-        own = (entry for table, _, entry in self.entries if table not in (*SINGLE_TABLES, "camera", "keypoints"))
-        return (*own, *self.skin)
+        others = (*SINGLE_TABLES, "camera", "keypoints", "plate")
+        return (*(entry for table, _, entry in self.entries if table not in others), *self.skin)
 
     @property
     def entries(self) -> Iterator[tuple[str, str, Any]]:
@@ -394,10 +401,10 @@ class Take(TakeHead):
 TABLES: dict[str, type[Any]] = {
     "take": TakeHead, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry,
     "camera": CameraEntry, "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry,
-    "stereo": StereoEntry,
+    "stereo": StereoEntry, "plate": PlateEntry,
 }  # fmt: skip
 """Tables of a take file but those of each `SensorKind`, and their keys as the fields of a record."""
-ATTRIBUTES = {"start": "placed", "camera": "cameras"}
+ATTRIBUTES = {"start": "placed", "camera": "cameras", "plate": "plates"}
 """{table: attribute of a `Take`} where they differ; the keys of [take] are attributes themselves."""
 SINGLE_TABLES = ("take", "session", "start", "calibration")
 

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import read_sides
-from kinefit.errors import ObservationError, TakeError, command, located
+from kinefit.errors import FileError, ObservationError, TakeError, command, located
 from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
+from kinefit.geometry.force_plates import ForcePlate
 from kinefit.observations import (
     MEDIAPIPE_33,
     ClickVideo,
@@ -33,6 +34,7 @@ from kinefit.readers.landmarks.detections import detections_file, read_detection
 from kinefit.readers.landmarks.keypoint_sets import FACE_SET
 from kinefit.readers.landmarks.keypoints import read_keypoints
 from kinefit.readers.markers import read_markers
+from kinefit.readers.plates import read_force_file
 from kinefit.readers.take.cameras import (
     TakeCameras,
     assumed_camera,
@@ -50,6 +52,7 @@ from kinefit.readers.take.depth import depth_notes, load_depth
 from kinefit.readers.take.entries import (
     KeypointsEntry,
     MarkersEntry,
+    PlateEntry,
     Take,
     old_attribute,
     read_each,
@@ -107,6 +110,8 @@ class Observations:
         Time of step 0: that of the first frame in a take of markers alone, so that forces of the trial stay in step.
     static_markers : tuple of Markers or None
         Static trial of each of `markers`.
+    plates : tuple of ForcePlate
+        Of marker files and of `take.plates`, in the take's world and by its clock.
     """
 
     rate: float
@@ -124,6 +129,7 @@ class Observations:
     notes: tuple[str, ...] = ()
     first_time: float = 0.0
     static_markers: tuple[Markers | None, ...] = ()
+    plates: tuple[ForcePlate, ...] = ()
 
     if not TYPE_CHECKING:
 
@@ -221,6 +227,8 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
             rates[stream] = read.rate
         streams[stream] = times + of_cameras.offset(source.camera)
         keypoints.append((read, streams[stream]))
+    plates = [plate.shifted(e.time_offset) for e, m in zip(take.markers, markers) for plate in m.plates]
+    plates += [plate for each in read_each(take, take.plates, _read_plates) for plate in each]
     deep = read_each(take, take.depth, partial(load_depth, cameras=of_cameras))
     depth = tuple(video for video in deep if isinstance(video, DepthVideo))
     clouds = tuple(video for video in deep if isinstance(video, CloudVideo))
@@ -273,7 +281,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     cameras += [video.camera for video in depth if video.camera is not None]
     return Observations(
         rate=rate, frames=frames, rig=Rig(tuple(cameras)) if cameras else None,
-        markers=markers, static_markers=static_markers,
+        markers=markers, static_markers=static_markers, plates=_named_apart(plates),
         keypoints=tuple(_cut(*k, rate, frames, entry) for k, entry in zip(keypoints, take.keypoints)),
         videos={e.name: e.video for e in take.cameras if e.video is not None}, images=images,
         depth=depth, clouds=clouds, sensors=sensors, skin=skin,
@@ -341,10 +349,31 @@ def _read_markers(entry: MarkersEntry, file: Path) -> Markers:
     if entry.sides:
         names, positions = read_sides(markers.names, markers.positions, entry.sides)
         markers = replace(markers, names=names, positions=positions)
+    if str(entry.sides).startswith("mirrored"):
+        markers = replace(markers, plates=())  # nothing says whether they are mirrored, too
     if not (any(entry.shift) or any(entry.turn)):
         return markers
-    up = markers.up if max(abs(v) for v in entry.turn) < _LEVEL else None
-    return replace(markers, positions=se3.apply(entry.T_world_file, markers.positions), up=up)
+    T, up = entry.T_world_file, markers.up if max(abs(v) for v in entry.turn) < _LEVEL else None
+    plates = tuple(plate.moved(T) for plate in markers.plates)
+    return replace(markers, positions=se3.apply(T, markers.positions), up=up, plates=plates)
+
+
+def _read_plates(entry: PlateEntry) -> tuple[ForcePlate, ...]:
+    """Force plates of a file of their own, in the take's world and by its clock."""
+    if entry.file.suffix.lower() == ".c3d":
+        found = read_markers(entry.file).plates
+    else:
+        found = read_force_file(entry.file).plates
+    if not found:
+        remedy = "Name the C3D of the trial, or its ground forces as .mot."
+        raise FileError("no force plates in this file", file=entry.file, remedy=remedy)
+    return tuple(plate.moved(entry.T_world_file).shifted(entry.time_offset) for plate in found)
+
+
+def _named_apart(plates: Sequence[ForcePlate]) -> tuple[ForcePlate, ...]:
+    """Plates of several files, each with a name of its own."""
+    once = len({plate.name for plate in plates}) == len(plates)
+    return tuple(plates if once else (replace(p, name=f"plate {k}") for k, p in enumerate(plates, 1)))
 
 
 def _cut(

@@ -104,6 +104,7 @@ FORMATS = Extensions("kinefit.exporters", MotionFormat, "format", dict([
     _own("jsonl", "motion.jsonl", "poses as JSON lines, as kinefit live sends them; for the Blender add-on", (), _UPS,
          why="JSON lines are in metres, with the names of the body's segments"),
     _own("mot", "motion.mot", "angles over time for OpenSim", why=_OPENSIM),
+    _own("forces", "forces.mot", "ground forces of plates for OpenSim; with mot where there are plates", why=_OPENSIM),
     _own("osim", "body.osim", "the fitted body for OpenSim", why=_OPENSIM),
 ]))  # fmt: skip
 """All formats of motions, by name."""
@@ -176,7 +177,7 @@ def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: St
     """Write a motion in several formats; written files are added to `files`."""
     from kinefit._mapped import release
 
-    formats = tuple(formats)
+    formats = tuple(dict.fromkeys([*formats, *["forces"] * bool(motion.plates and "mot" in formats)]))
     for number, format in enumerate(formats):
         step("results", number, len(formats))
         path = folder / FORMATS.get(format).file

@@ -1,0 +1,257 @@
+"""Feet on force plates: whose step a plate measured, when it began and ended, and what is wrong with a plate.
+
+A step counts where one foot stands wholly on a plate, or on plates together, and the other does not touch them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.bodies.masses import segment_masses
+from kinefit.bodies.motion import Motion
+from kinefit.findings import Finding
+from kinefit.geometry.force_plates import LEAST_LOAD, ForcePlate
+
+FOOT = "heel", "metatarsal_phalanx_1", "metatarsal_phalanx_5"
+"""Landmarks of a foot, after "l_" or "r_"."""
+
+GRAVITY = 9.81
+"""[m/s²]"""
+
+CONTACT_STD_S = 0.003
+"""[s] that a load takes to rise to 20 N at the 5 to 10 kN/s of a heel."""
+
+_MIN_STEP_S, _MIN_PEAK = 0.1, 40.0  # [s], [N]: shorter or lighter, it is no step
+_MAX_OFF = 0.12  # [m] of the centre of pressure from the line between heel and ball: half a foot's width and its toes
+_NEARER = 0.05  # [m] by which the other foot is farther away, so that it is known whose step it is
+_EDGE = 0.03  # [m] beyond a plate's edge: the skin and errors of landmarks
+_MOVING = 0.5  # [m/s] of a foot that swings past the other: it stands on nothing
+_BESIDE, _RIGHT = 0.06, 0.04  # [m] from the foot in the median: surely wrong, and surely right once it is corrected
+_BETTER = 0.4  # of the distance before, once it is corrected
+_SAME_S = 0.12  # [s] between an event of a plate and that of the motion which is the same
+_LATE_S, _MAX_SPREAD_S = 0.05, 0.03  # [s]: events by the feet's speed are right to 12 ms
+_STAND_S, _STEADY, _DOUBT = 0.5, 0.02, 3.0  # [s] of standing still, as the relative deviation of the load says; sigmas
+_LOADS = 0.45, 12.0  # [body weights] of the largest load: a step that is not whole, a landing
+
+
+@dataclass(frozen=True, eq=False)
+class Footfall:
+    """A foot on a plate.
+
+    Parameters
+    ----------
+    plate : name
+    side : "left" or "right"
+    contact, off : [s] when the load rises above 20 N and falls below; NaN where the record begins or ends under load
+    """
+
+    plate: str
+    side: str
+    contact: float
+    off: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Loaded:
+    """A time in which somebody stands on a plate: samples [first, stop), and where the feet then are.
+
+    Parameters
+    ----------
+    cop : (n, 2) [m] centre of pressure along the plate's axes, from its centre, at samples of half the largest load
+    feet : (n, 2, 3, 2) [m] heel and ball landmarks of both feet, likewise; speeds : (n, 2, 3) [m/s]
+    """
+
+    plate: ForcePlate
+    first: int
+    stop: int
+    cop: NDArray
+    feet: NDArray
+    speeds: NDArray
+
+    @property
+    def offsets(self) -> NDArray:
+        """(n, 2, 2) [m] from the nearest point of the line from heel to ball of each foot to the centre of pressure."""
+        return self.offsets_of(self.cop)
+
+    def offsets_of(self, cop: NDArray) -> NDArray:
+        """As `offsets`, of another centre of pressure (n, 2)."""
+        heel, ball = self.feet[:, :, 0], self.feet[:, :, 1:].mean(axis=2)
+        way = ball - heel
+        along = np.sum((cop[:, None] - heel) * way, axis=-1) / np.maximum(np.sum(way * way, axis=-1), 1e-9)
+        return cop[:, None] - heel - np.clip(along, 0.0, 1.3)[..., None] * way  # toes are ahead of the ball
+
+    def is_over(self, side: int) -> NDArray:
+        """(n, 3) bool: points of a foot that are over the plate."""
+        half = 0.5 * np.ptp((self.plate.corners - self.plate.centre) @ self.plate.axes.T, axis=0) + _EDGE
+        return np.asarray(np.all(np.abs(self.feet[:, side]) < half, axis=-1))
+
+    def time_of(self, end: int) -> float:
+        """[s] when the load crosses 20 N at one end of the samples; NaN at the ends of the record."""
+        load = self.plate.load
+        if not 0 < end < len(load):
+            return np.nan
+        a, b = load[end - 1], load[end]
+        return float(self.plate.times[end - 1] + (LEAST_LOAD - a) / (b - a) / self.plate.rate)
+
+
+def footfalls(motion: Motion) -> list[Footfall]:
+    """Steps of one foot alone on a plate, or on several plates, in the order of their contacts."""
+    found: list[Footfall] = []
+    for one in _loaded(motion):
+        if (side := _side(one)) is None:
+            continue
+        step = Footfall(one.plate.name, ("left", "right")[side], one.time_of(one.first), one.time_of(one.stop))
+        other = next((f for f in found if f.side == step.side and _overlap(f, step)), None)
+        whole = one.is_over(side).mean() > 0.9
+        if other is not None:
+            found.remove(other)
+            times = np.fmin(other.contact, step.contact), np.fmax(other.off, step.off)
+            step = Footfall(f"{other.plate}, {step.plate}", step.side, float(times[0]), float(times[1]))
+        elif not whole:
+            step = Footfall(step.plate, step.side, np.nan, np.nan)  # until the rest of it is found on another plate
+        found.append(step)
+    known = [f for f in found if np.isfinite([f.contact, f.off]).any()]
+    return sorted(known, key=lambda f: np.nan_to_num(f.contact, nan=f.off))
+
+
+def _overlap(a: Footfall, b: Footfall) -> bool:
+    return not (a.off < b.contact or b.off < a.contact)
+
+
+def _side(one: _Loaded) -> int | None:
+    """0 for the left foot, 1 for the right one; None where it is not sure, or both stand there."""
+    apart = np.median(np.linalg.norm(one.offsets, axis=-1), axis=0)
+    side = int(np.argmin(apart))
+    if apart[side] > _MAX_OFF or apart[1 - side] < apart[side] + _NEARER:
+        return None
+    others = one.is_over(1 - side) & (one.speeds[:, 1 - side] < _MOVING)
+    return None if others.any(axis=1).mean() > 0.2 else side
+
+
+def _loaded(motion: Motion) -> Iterator[_Loaded]:
+    """All times in which somebody stands on a plate while the body is known."""
+    names = [f"{side}_{name}" for side in "lr" for name in FOOT]
+    if not motion.plates or len(motion) < 2 or any(name not in motion.body.landmarks.names for name in names):
+        return
+    points = motion.positions(motion.body.landmarks.select(tuple(names)))
+    speeds = np.linalg.norm(np.gradient(points, 1.0 / motion.rate, axis=0), axis=-1)
+    table = np.concatenate([points.reshape(len(points), -1), speeds], axis=1)
+    for plate in motion.plates:
+        load, times = plate.load, plate.times
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], load >= LEAST_LOAD, [False]]).astype(int)))
+        cop = (plate.centre_of_pressure() - plate.centre) @ plate.axes.T
+        for first, stop in edges.reshape(-1, 2):
+            used = first + np.flatnonzero(load[first:stop] > 0.5 * load[first:stop].max())
+            used = used[(times[used] >= motion.times[0]) & (times[used] <= motion.times[-1])]
+            if (stop - first) / plate.rate < _MIN_STEP_S or load[first:stop].max() < _MIN_PEAK or not len(used):
+                continue
+            now = np.column_stack([np.interp(times[used], motion.times, column) for column in table.T])
+            at = (now[:, :18].reshape(-1, 2, 3, 3) - plate.centre) @ plate.axes.T
+            yield _Loaded(plate, int(first), int(stop), cop[used], at, now[:, 18:].reshape(-1, 2, 3))
+
+
+def standing_mass(plates: Sequence[ForcePlate], body: Body) -> float | None:
+    """[kg] of a person who stands still with all weight on plates; None where nobody does.
+
+    The load is steady to 2 % for half a second or more, and the mass is one that people of the stature have: what else
+    stands on plates, or beside them with one foot, is far from it.
+    """
+    if not plates:
+        return None
+    first = min(plates, key=lambda plate: plate.first_time)
+    total = np.sum([np.interp(first.times, plate.times, plate.load, 0.0, 0.0) for plate in plates], axis=0)
+    count = round(_STAND_S * first.rate)
+    if len(total) < count:
+        return None
+    windows = np.lib.stride_tricks.sliding_window_view(total, count)[:: max(count // 10, 1)]
+    mean, std = windows.mean(axis=1), windows.std(axis=1)
+    steady = mean[(std < _STEADY * mean) & (mean > LEAST_LOAD)]
+    expected = segment_masses(body)
+    middle, spread = float(expected.masses.sum()), expected.std
+    found = float(np.median(steady)) / GRAVITY if len(steady) else 0.0
+    return found if found and abs(found - middle) < _DOUBT * spread else None
+
+
+def by_plates(steps: Sequence[Footfall], side: str, end: str, times: NDArray, stds: NDArray) -> tuple[NDArray, NDArray]:
+    """Events of a foot with those that a plate measured in place of the motion's, and others that it alone shows.
+
+    Parameters
+    ----------
+    steps : as `footfalls` finds them
+    side : "left" or "right"; end : "contact" or "off"
+    times, stds : (N,) [s] of the motion
+
+    Returns
+    -------
+    times, stds : (M,) [s], in increasing order
+    """
+    found = [(getattr(step, end), CONTACT_STD_S) for step in steps if step.side == side]
+    found = [(time, std) for time, std in found if np.isfinite(time)]
+    kept = [pair for pair in zip(times, stds) if all(abs(pair[0] - time) > _SAME_S for time, _ in found)]
+    table = np.array(sorted([*kept, *found])).reshape(-1, 2)
+    return table[:, 0], table[:, 1]
+
+
+def plate_findings(motion: Motion, events: Sequence[tuple[NDArray, NDArray]]) -> list[Finding]:
+    """What is wrong with plates: moved, turned, late, or of another unit, as the feet and the load tell.
+
+    Parameters
+    ----------
+    events : contacts (N,) and toe-offs (M,) [s] of the left and of the right foot, as its motion tells them
+    """
+    out, loaded = [], list(_loaded(motion))
+    weight = GRAVITY * float(segment_masses(motion.body).masses.sum())
+    for plate in motion.plates:
+        own = [one for one in loaded if one.plate is plate]
+        if not own:
+            continue
+        peak = max(float(one.plate.load[one.first : one.stop].max()) for one in own) / weight
+        if not _LOADS[0] < peak < _LOADS[1] and len(loaded) > 1:
+            text = f"The largest load on {plate.name} is {peak:.2g} body weights: its forces are not in newtons."
+            out.append(_finding(text, "Likely; a person who only touches it does the same.", "unit"))
+        elif text := _misplaced(own):
+            out.append(_finding(text, "Likely: so corrected, each step lies under its foot.", "corners"))
+    late = np.array([off for one in loaded for off in _lateness(one, events)])
+    spread = 1.48 * float(np.median(np.abs(late - np.median(late)))) if len(late) else np.inf
+    if len(late) > 1 and abs(np.median(late)) > _LATE_S and spread < _MAX_SPREAD_S:
+        std = max(spread, 0.012) / np.sqrt(len(late))
+        text = f"The plates' clock is {np.median(late):+.3f} ± {std:.3f} s beside that of the motion."
+        out.append(_finding(text, f"Likely, by {len(late)} contacts and toe-offs.", "time_offset"))
+    return out
+
+
+def _lateness(one: _Loaded, events: Sequence[tuple[NDArray, NDArray]]) -> Iterator[float]:
+    """[s] from the nearest events of the foot that stands on a plate to those of its load."""
+    apart = np.median(np.linalg.norm(one.offsets, axis=-1), axis=0)
+    if apart.min() < _MAX_OFF:
+        for end, times in zip((one.first, one.stop), events[int(np.argmin(apart))]):
+            if len(times) and np.isfinite(time := one.time_of(end)):
+                yield float(min(time - times, key=abs))
+
+
+def _finding(text: str, confidence: str, key: str) -> Finding:
+    remedy = f"Correct the {key} of its [[plate]], or of the group FORCE_PLATFORM in the C3D."
+    return Finding("doubt", "plates", text, (), confidence, remedy)
+
+
+def _misplaced(own: list[_Loaded]) -> str:
+    """How a plate lies beside where it is said to lie; "" where it does not, or nothing explains it."""
+    turns = {"turned by 180 degrees": (-1, -1), "mirrored along x": (-1, 1), "mirrored along y": (1, -1)}
+    nearest = lambda one, cop: min(np.moveaxis(one.offsets_of(cop), 1, 0), key=lambda e: np.median(np.hypot(*e.T)))
+    distance = lambda offsets: float(np.median(np.hypot(*np.concatenate(offsets).T)))
+    as_said = [nearest(one, one.cop) for one in own]
+    before = distance(as_said)
+    if before < _BESIDE:
+        return ""
+    shift = np.median(np.concatenate(as_said), axis=0)
+    found = {how: distance([nearest(one, one.cop * signs) for one in own]) for how, signs in turns.items()}
+    found[f"shifted by {100 * np.hypot(*shift):.0f} cm"] = distance([nearest(one, one.cop - shift) for one in own])
+    good = [how for how, after in found.items() if after < min(_RIGHT, _BETTER * before)]
+    if not good:
+        return ""
+    return f"{own[0].plate.name} is {' or '.join(good)}: its centre of pressure is {100 * before:.0f} cm from the foot."

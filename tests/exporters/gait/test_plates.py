@@ -1,0 +1,100 @@
+"""A child's walk over two real plates: whose steps they measured, what is wrong with moved ones, and in files."""
+
+import re
+from dataclasses import replace
+
+import ezc3d
+import numpy as np
+import pytest
+
+from kinefit import fit_marker_subject, fit_markers, load_body, read_markers, read_motion, write_motion
+from kinefit.exporters import write_c3d, write_forces
+from kinefit.exporters.gait.plates import by_plates, footfalls, plate_findings
+from kinefit.exporters.report.feet import foot_events
+from kinefit.readers.plates import read_force_file
+
+
+@pytest.fixture(scope="module")
+def walk(data_dir):
+    markers = read_markers(data_dir("gait_biomechzoo") / "HC030A" / "straight.c3d")
+    return fit_markers(fit_marker_subject(load_body("humanoid"), markers, frames=12), markers, smooth=False)
+
+
+def events_of(motion):
+    feet = foot_events(motion, plates=False)
+    return [(foot.contacts, foot.offs) for foot in (feet.left, feet.right)]
+
+
+def test_steps_are_those_of_the_plates(walk):
+    right, left = footfalls(walk)
+    assert (right.plate, right.side, left.plate, left.side) == ("plate 2", "right", "plate 1", "left")
+    assert [right.contact, right.off] == pytest.approx([3.028, 3.643], abs=0.003)
+    assert [left.contact, left.off] == pytest.approx([3.544, 4.173], abs=0.003)
+
+
+def test_events_of_plates_replace_those_of_the_feet(walk):
+    (left, _), steps = events_of(walk), footfalls(walk)
+    times, stds = by_plates(steps, "left", "contact", left[0], np.full(len(left[0]), 0.01))
+    assert len(times) == len(left[0]) and np.all(np.diff(times) > 0)
+    assert stds.min() == pytest.approx(0.003) and np.sum(stds < 0.01) == 1
+    assert np.min(np.abs(times - steps[1].contact)) == 0.0
+    alone, _ = by_plates(steps, "left", "off", np.zeros(0), np.zeros(0))
+    assert alone == pytest.approx([steps[1].off])
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda p: p, ""),
+        (lambda p: replace(p, corners=p.corners + [0.15, 0.1, 0.0]), "shifted by 1"),
+        (lambda p: replace(p, moment=p.moment * [-1.0, -1.0, 1.0]), "turned by 180 degrees"),
+        (lambda p: p.shifted(0.12), "clock is [+]0.12. ±"),
+        (lambda p: replace(p, force=p.force / 4.448, moment=p.moment / 4.448), "not in newtons"),
+    ],
+)
+def test_a_wrong_plate_is_named(walk, change, text):
+    found = plate_findings(replace(walk, plates=tuple(map(change, walk.plates))), events_of(walk))
+    if not text:
+        assert not found
+        return
+    assert found and all(f.remedy and f.confidence for f in found)
+    assert any(re.search(text, f.text) for f in found)
+
+
+def test_nothing_is_said_of_plates_without_feet_or_load(walk):
+    empty = replace(walk, plates=tuple(replace(p, force=0.0 * p.force, moment=0.0 * p.moment) for p in walk.plates))
+    assert not footfalls(empty) and not plate_findings(empty, events_of(walk))
+    assert not footfalls(replace(walk, plates=()))
+
+
+def test_plates_go_with_the_motion(walk, tmp_path):
+    write_motion(walk, tmp_path / "m.npz")
+    back = read_motion(tmp_path / "m.npz")
+    for a, b in zip(walk.plates, back.plates, strict=True):
+        assert (a.name, a.rate, a.first_time) == (b.name, b.rate, b.first_time)
+        np.testing.assert_array_equal(a.force, b.force)
+        np.testing.assert_array_equal(a.corners, b.corners)
+    turned = back.turned("y")
+    np.testing.assert_allclose(turned.plates[0].load, walk.plates[0].load, atol=1e-9)
+    assert turned.plates[0].normal @ [0.0, 1.0, 0.0] > 0.99
+
+
+def test_c3d_has_the_plates(walk, tmp_path):
+    write_c3d(walk, tmp_path / "m.c3d")
+    for a, b in zip(walk.plates, read_markers(tmp_path / "m.c3d").plates, strict=True):
+        np.testing.assert_allclose(a.force, b.force, atol=1e-3)
+        np.testing.assert_allclose(a.moment, b.moment, atol=1e-4)
+        np.testing.assert_allclose(a.times, b.times, atol=1e-9)
+    others = ezc3d.c3d(str(tmp_path / "m.c3d"), extract_forceplat_data=True)["data"]["platform"]
+    stood = walk.plates[0].load > 50.0
+    found = 1e-3 * others[0]["center_of_pressure"].T[stood]
+    np.testing.assert_allclose(found, walk.plates[0].centre_of_pressure()[stood], atol=1e-4)
+
+
+def test_opensim_has_the_forces(walk, tmp_path):
+    write_forces(walk, tmp_path / "forces.mot")
+    for a, b in zip(walk.turned("y").plates, read_force_file(tmp_path / "forces.mot").plates, strict=True):
+        stood = a.load > 50.0
+        np.testing.assert_allclose(a.force[stood], b.force[stood], atol=1e-5)
+        np.testing.assert_allclose(a.centre_of_pressure()[stood], b.centre_of_pressure()[stood], atol=1e-5)
+        np.testing.assert_allclose(a.free_moment()[stood], b.free_moment()[stood], atol=1e-5)
