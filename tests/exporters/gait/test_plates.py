@@ -9,7 +9,7 @@ import pytest
 
 from kinefit import fit_marker_subject, fit_markers, load_body, read_markers, read_motion, write_motion
 from kinefit.exporters import write_c3d, write_forces
-from kinefit.exporters.gait.plates import by_plates, footfalls, plate_findings
+from kinefit.exporters.gait.plates import by_plates, footfalls, plate_findings, standing_mass
 from kinefit.exporters.report.feet import foot_events
 from kinefit.readers.plates import read_force_file
 
@@ -98,3 +98,14 @@ def test_opensim_has_the_forces(walk, tmp_path):
         np.testing.assert_allclose(a.force[stood], b.force[stood], atol=1e-5)
         np.testing.assert_allclose(a.centre_of_pressure()[stood], b.centre_of_pressure()[stood], atol=1e-5)
         np.testing.assert_allclose(a.free_moment()[stood], b.free_moment()[stood], atol=1e-5)
+
+
+def test_who_stands_on_plates_is_weighed(data_dir):
+    folder = data_dir("gait_biomechzoo")
+    for name, mass, stature in (("HC030A", 45.8, 1.48), ("HC044A", 39.4, 1.45)):
+        body = replace(load_body("humanoid"), stature=stature)
+        static, walk = (read_markers(folder / name / f"{trial}.c3d").plates for trial in ("static", "straight"))
+        assert standing_mass(static, body) == pytest.approx(mass, rel=0.02)
+        assert standing_mass(walk, body) is None and standing_mass((), body) is None
+        pounds = tuple(replace(p, force=p.force / 4.448) for p in static)
+        assert standing_mass(pounds, body) is None

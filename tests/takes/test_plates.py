@@ -1,0 +1,74 @@
+"""Force plates in takes: with the markers of a C3D, in a file of their own, moved, and as `init` proposes them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kinefit import fit_marker_subject, fit_markers, load_body, load_observations, read_markers, read_take
+from kinefit.errors import FileError
+from kinefit.exporters import write_forces, write_markers
+from kinefit.readers.guess.folder import guess_take
+
+
+@pytest.fixture(scope="module")
+def folder(data_dir, tmp_path_factory):
+    """A walk as TRC, and the forces of its plates as MOT, both y up."""
+    out = tmp_path_factory.mktemp("plates")
+    markers = read_markers(data_dir("gait_biomechzoo") / "HC030A" / "straight.c3d").trimmed()
+    subject = fit_marker_subject(load_body("humanoid"), markers, frames=6)
+    short = replace(markers, positions=markers.positions[:20], residual=None)
+    motion = fit_markers(subject, short, smooth=False).turned("y")
+    write_forces(motion, out / "walk_grf.mot")
+    turned = markers.positions[..., [0, 2, 1]] * [1.0, 1.0, -1.0]
+    write_markers(replace(markers, positions=turned, up="y", residual=None), out / "walk.trc")
+    return out
+
+
+def take(folder, lines):
+    file = folder / "own.toml"
+    file.write_text(f'[take]\nup = "y"\nbody = "humanoid"\n[[markers]]\nfile = "walk.trc"\n{lines}')
+    return read_take(file)
+
+
+def test_init_proposes_the_forces(folder):
+    text = guess_take(folder).text
+    assert '[[plate]]\nfile = "walk_grf.mot"' in text
+
+
+@pytest.mark.parametrize(
+    ("line", "moved"),
+    [("", [0, 0, 0]), ("shift = [0.5, 0.0, -0.2]\n", [0.5, 0.0, -0.2]), ("time_offset = 0.25\n", [0, 0, 0])],
+)
+def test_a_take_places_plates(folder, line, moved):
+    own = load_observations(take(folder, '[[plate]]\nfile = "walk_grf.mot"\n')).plates
+    plates = load_observations(take(folder, f'[[plate]]\nfile = "walk_grf.mot"\n{line}')).plates
+    assert len(plates) == len(own) == 2
+    for a, b in zip(own, plates):
+        np.testing.assert_allclose(b.centre - a.centre, moved, atol=1e-9)
+        assert b.first_time - a.first_time == pytest.approx(0.25 if "time" in line else 0.0)
+
+
+def test_a_turn_turns_forces(folder):
+    a, b = (
+        load_observations(take(folder, f'[[plate]]\nfile = "walk_grf.mot"\n{line}')).plates[0]
+        for line in ("", "turn = [0.0, 180.0, 0.0]\n")
+    )
+    np.testing.assert_allclose(b.force, a.force * [-1.0, 1.0, -1.0], atol=1e-6)
+
+
+def test_plates_of_a_c3d_come_with_its_markers(data_dir, tmp_path):
+    walk = data_dir("gait_biomechzoo") / "HC030A" / "straight.c3d"
+    file = tmp_path / "take.toml"
+    file.write_text(f'[take]\nup = "z"\n[[markers]]\nfile = "{walk.as_posix()}"\ntime_offset = 0.5\n')
+    plates, known = load_observations(read_take(file)).plates, read_markers(walk).plates
+    assert [p.name for p in plates] == ["plate 1", "plate 2"]
+    assert plates[0].first_time == pytest.approx(known[0].first_time + 0.5)
+    file.write_text(f'{file.read_text()}sides = "mirrored-x"\n')
+    assert not load_observations(read_take(file)).plates
+
+
+def test_a_file_without_plates_is_named(folder):
+    with pytest.raises(FileError, match="no force plates"):
+        write_markers(read_markers(folder / "walk.trc"), folder / "bare.c3d")
+        load_observations(take(folder, '[[plate]]\nfile = "bare.c3d"\n'))
