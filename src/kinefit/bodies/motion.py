@@ -425,12 +425,10 @@ def joint_columns(
     `names` default to the body's joints.
     """
     names = names or motion.body.joints
-    names, out = (*names, "com"), Columns()
-    for suffix, joints, centre in (
-        ("", motion.joint_centres, motion.centre_of_mass), (" std", motion.joint_std, motion.centre_of_mass_std)
-    ):  # fmt: skip
-        out |= place_columns(names, factor * np.concatenate([joints, centre[:, None]], axis=1), unit, suffix)
-    return out
+    joints = place_columns(names, factor * motion.joint_centres, unit)
+    joints |= place_columns(names, factor * motion.joint_std, unit, " std")
+    centre = place_columns(["com"], factor * motion.centre_of_mass[:, None], unit)
+    return joints | centre | place_columns(["com"], factor * motion.centre_of_mass_std[:, None], unit, " std")
 
 
 def place_columns(names: Sequence[str], positions: NDArray, unit: str, suffix: str = "") -> Columns:
