@@ -5,7 +5,8 @@
 Every file is fitted by `kinefit markers fit` with its static trial and defaults. A plate's truth is where its vertical
 force passes 20 N, of contacts that last a quarter of a second on one plate. The shares of the swing's speed that make
 an event were chosen on the children HC002D, HC036A and HC050A; the figures are of the others. Steps are compared with
-the heels' markers at the same times.
+the heels' markers at the same times. Events of the feet are those without plates; how many of the plates' the product
+itself finds, with the right foot, is a figure of its own.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, data, figure
 from kinefit.bodies.motion import Motion
+from kinefit.exporters.gait.plates import footfalls
 from kinefit.exporters.report.cycles import find_cycles, gait_numbers
 from kinefit.exporters.report.feet import foot_events
 from kinefit.observations import Markers
@@ -32,6 +34,7 @@ PRINTED = ("HC030A/straight", "HC030A/turn", "HC044A/straight", "HC044A/turn", "
 CHOSEN = ("HC002D/straight", "HC002D/turn", "HC036A/straight", "HC036A/turn", "HC050A/straight", "HC050A/turn")
 _FORCE_N, _PLATE_S, _LOADED_N = 20.0, 0.25, 200.0
 _NEAR_S, _NEAR_M, _ENDS_S = 0.15, 0.2, 0.12
+_SAME_S = 0.003  # of the plates' own events
 _LABELS = {"Foot Strike": "contact", "Foot Off": "off"}
 
 
@@ -47,12 +50,13 @@ class Event:
 def run() -> None:
     """Print the figures of the walks that were kept back, and of all how many have a record."""
     off: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    steps, records = list[float](), list[bool]()
+    steps, records, plated = list[float](), list[bool](), list[bool]()
     for name in (*PRINTED, *CHOSEN)[: amount(None, 1)]:
         path = file_of(name)
         if path is None:
             continue
-        motion, markers = fitted(path), read_markers(path)
+        measured, markers = fitted(path), read_markers(path)
+        motion = replace(measured, plates=())  # events of the feet alone
         cycles = find_cycles(motion)
         records.append(cycles is not None and cycles.kind == "gait")
         if name in CHOSEN:
@@ -61,11 +65,17 @@ def run() -> None:
             for event in events:
                 off.setdefault((source, event.kind), []).append(_missed(motion, event))
         steps += _steps(motion, markers)
+        found = [(step.side[0], time) for step in footfalls(measured) for time in (step.contact, step.off)]
+        plated += [
+            any(side == event.foot and abs(time - event.time) < _SAME_S for side, time in found)
+            for event in _plates(path, markers)
+        ]  # fmt: skip
     for source in ("plates", "files"):
         for kind in ("contact", "off"):
             _print(f"gait_{kind}_{source}", np.array(off.get((source, kind), [])).reshape(-1, 2))
     reason = "" if steps else "no recording"
     figure("gait_step_mm", float(np.sqrt(np.mean(np.square(steps)))) if steps else None, "mm RMS", "<= 5", reason)
+    figure("gait_plates_found", 100.0 * float(np.mean(plated)) if plated else None, "% of events", ">= 90", reason)
     figure("gait_records", 100.0 * float(np.mean(records)) if records else None, "% of files", ">= 100", reason)
 
 

@@ -11,9 +11,8 @@ from kinefit._arguments import checked
 from kinefit.bodies import Body, load_body
 from kinefit.bodies.motion import Motion
 from kinefit.errors import KinefitError, TakeError, command, located
-from kinefit.exporters.gait.plates import plate_findings, standing_mass
-from kinefit.exporters.report.feet import foot_events
-from kinefit.findings import Finding
+from kinefit.exporters.gait.plates import standing_mass
+from kinefit.exporters.report.feet import plate_faults
 from kinefit.fitting.smoothing.online.lag_frame import KnownNoise
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.subject.subject import Subject
@@ -111,7 +110,7 @@ def track_take(
         except KinefitError as error:
             raise with_cause(error, findings) from error
     motion = replace(motion.with_mass(_mass_of(take, seen, motion.body)), plates=seen.plates)
-    motion = with_findings(motion, (*findings, *_of_plates(motion)), seen, take.height)
+    motion = with_findings(motion, (*findings, *plate_faults(motion)), seen, take.height)
     motion = on_floor(motion, recording, view.floors if view else [])
     if seen.rig is not None:
         seen = replace(seen, rig=rig_on_floor(as_found(seen.rig, motion.provenance), motion.provenance))
@@ -122,14 +121,7 @@ def _mass_of(take: Take, seen: Observations, body: Body) -> float | None:
     """[kg] that the take states, or of a person who stands on the plates of a static trial, or of the trial itself."""
     if take.mass is not None:
         return take.mass
-    trials = [*(m.plates for m in seen.static_markers if m is not None), seen.plates]
-    return next((mass for plates in trials if (mass := standing_mass(plates, body)) is not None), None)
-
-
-def _of_plates(motion: Motion) -> list[Finding]:
-    """What is wrong with the force plates of a motion, by its feet."""
-    feet = foot_events(motion, plates=False) if motion.plates else None
-    return plate_findings(motion, [(f.contacts, f.offs) for f in (feet.left, feet.right)]) if feet else []
+    return standing_mass([*(m.plates for m in seen.static_markers if m is not None), seen.plates], body)
 
 
 def settings_of(take: Take, settings: TrackSettings | None = None) -> TrackSettings:

@@ -105,7 +105,7 @@ def test_who_stands_on_plates_is_weighed(data_dir):
     for name, mass, stature in (("HC030A", 45.8, 1.48), ("HC044A", 39.4, 1.45)):
         body = replace(load_body("humanoid"), stature=stature)
         static, walk = (read_markers(folder / name / f"{trial}.c3d").plates for trial in ("static", "straight"))
-        assert standing_mass(static, body) == pytest.approx(mass, rel=0.02)
-        assert standing_mass(walk, body) is None and standing_mass((), body) is None
+        assert standing_mass([(), walk, static], body) == pytest.approx(mass, rel=0.02)
+        assert standing_mass([walk], body) is None and standing_mass([], body) is None
         pounds = tuple(replace(p, force=p.force / 4.448) for p in static)
-        assert standing_mass(pounds, body) is None
+        assert standing_mass([pounds], body) is None

@@ -270,6 +270,8 @@ def fit_file(
         and right are wrong (see `label_findings`).
     """
     from kinefit.exporters import write_markers, write_osim, write_trc
+    from kinefit.exporters.gait.plates import standing_mass
+    from kinefit.exporters.report.feet import plate_faults
     from kinefit.exporters.report.report import write_report
     from kinefit.fitting.markers.sides import label_findings, refuse_wrong_sides
     from kinefit.fitting.markers.subject import fit_marker_subject
@@ -308,7 +310,9 @@ def fit_file(
         motion = fit_markers(
             subject, markers, limits=options.limits, up=options.up, smooth=options.smooth, progress=step
         )
-        findings = [*faults_of(found_labels), *motion_findings(motion, options.height)]
+        if len(people) == 1 and options.mass is None:
+            motion = motion.with_mass(standing_mass([trial.plates if trial else (), markers.plates], motion.body))
+        findings = [*faults_of(found_labels), *motion_findings(motion, options.height), *plate_faults(motion)]
         motion = replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings)})
         if notes is not None:
             notes += [*findings, *(f for f in found_labels if f.severity == "note")]

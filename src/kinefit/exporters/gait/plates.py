@@ -155,14 +155,16 @@ def _loaded(motion: Motion) -> Iterator[_Loaded]:
             yield _Loaded(plate, int(first), int(stop), cop[used], at, now[:, 18:].reshape(-1, 2, 3))
 
 
-def standing_mass(plates: Sequence[ForcePlate], body: Body) -> float | None:
-    """[kg] of a person who stands still with all weight on plates; None where nobody does.
+def standing_mass(trials: Sequence[Sequence[ForcePlate]], body: Body) -> float | None:
+    """[kg] of a person who stands still with all weight on plates in the first trial that shows it; None without one.
 
-    The load is steady to 2 % for half a second or more, and the mass is one that people of the stature have: what else
+    Plates of each trial. The load is steady to 2 % for half a second or more, and the mass is one that people of the stature have: what else
     stands on plates, or beside them with one foot, is far from it.
     """
-    if not plates:
-        return None
+    return next((mass for plates in trials if plates and (mass := _standing(plates, body))), None)
+
+
+def _standing(plates: Sequence[ForcePlate], body: Body) -> float | None:
     first = min(plates, key=lambda plate: plate.first_time)
     total = np.sum([np.interp(first.times, plate.times, plate.load, 0.0, 0.0) for plate in plates], axis=0)
     count = round(_STAND_S * first.rate)

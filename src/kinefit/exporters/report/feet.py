@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.motion import Motion, rotation_between_up
-from kinefit.exporters.gait.plates import Footfall, by_plates, footfalls
+from kinefit.exporters.gait.plates import Footfall, by_plates, footfalls, plate_findings
+from kinefit.findings import Finding
 
 LEAST_STEP = 0.12  # share of the stature that a foot travels to and fro at least: shuffling 20 cm strides of an adult
 MIN_STRIDE_S = 0.4  # [s]: sprinters take 0.45 s
@@ -99,6 +100,12 @@ def foot_events(motion: Motion, *, plates: bool = True) -> Feet | None:
     steps = footfalls(motion) if plates else []
     sides = (_with_plates(left, steps), _with_plates(right, steps))
     return Feet(*sides, belt, (bool(observed[0]), bool(observed[1])), backwards)
+
+
+def plate_faults(motion: Motion) -> list[Finding]:
+    """What is wrong with the force plates of a motion, by what its feet show alone."""
+    feet = foot_events(motion, plates=False) if motion.plates else None
+    return plate_findings(motion, [(f.contacts, f.offs) for f in (feet.left, feet.right)]) if feet else []
 
 
 def _with_plates(foot: FootEvents, steps: Sequence[Footfall]) -> FootEvents:
