@@ -16,6 +16,7 @@ PARTS = {
     "metaballs": "an arm of metaballs fitted to points",
     "surface_arm": "a bare arm before two cameras, tracked",
     "surface_clothes": "skin and clothes of real people: followed in one camera, measured between two",
+    "surface_sequences": "real textured images that move: points followed, said to be lost, wrong; bright spheres",
     "clicked": "poses from joints clicked in three images",
     "retarget": "recorded motions on other characters, in the Khronos validator",
 }

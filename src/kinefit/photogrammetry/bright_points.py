@@ -7,7 +7,7 @@ that is wider. D'Apuzzo et al. (1999) track targets on the body by their centroi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ _MIN_PIXELS = 3  # of a spot, for a centroid
 _MAX_ASPECT = 2.0  # length over width of a spot
 _CENTROID_VARIANCE = 0.1**2  # [px²]
 _MAX_RAY_GAP_PX = 2.0  # between views: distance of the intersection of rays from each spot
+_MAX_FRAMES_MISSED = 5  # in which a point is predicted; it keeps its id if it is found again
 _MAX_CONTRAST_RATIO = 2.0  # of a point's contrast in one frame to the next
 _MAX_AMBIGUITY = 0.5  # distance of the nearest spot to that of the next
 
@@ -60,7 +61,7 @@ class BrightPointTracker(SurfaceTracker):
     """Tracks bright points through images of synchronised cameras: `update` once per frame, `trajectories` at the end.
 
     A point is predicted linearly in every image and found at the spot that is nearest to its prediction, if no other
-    point and no other spot is about as near. The rays of all views must meet. Spots that belong to no point are
+    point and no other spot is about as near. It may be missed in five frames. The rays of all views must meet. Spots that belong to no point are
     associated between the views by their rays, if only one combination fits, and become new points.
 
     Parameters
@@ -71,7 +72,12 @@ class BrightPointTracker(SurfaceTracker):
     """
 
     diameter: int = 10
-    _contrast: NDArray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        views = len(self.rig)  # of each point that ever was: its last place, motion per frame, contrast and frame
+        self._uv, self._moves = np.zeros((0, views, 2)), np.zeros((0, views, 2))
+        self._contrast, self._seen = np.zeros((0, views)), np.zeros(0, int)
 
     def _measure_first(self, images: Sequence[SplineImage]) -> SurfacePoints:
         spots = self._find(images)
@@ -81,26 +87,27 @@ class BrightPointTracker(SurfaceTracker):
         return self._associated(spots)
 
     def _track(self, images: Sequence[SplineImage]) -> tuple[SurfacePoints, NDArray]:
-        last = self._frames[-1]
-        uv, good = last.uv.copy(), np.ones(len(last), bool)
-        known = np.full((self._next, len(images)), np.nan)
-        known[: len(self._contrast)] = self._contrast if len(self._contrast) else np.nan
-        self._contrast = known
+        frame = len(self._frames)
+        ids = np.flatnonzero(frame - self._seen <= 1 + _MAX_FRAMES_MISSED)
+        elapsed = (frame - self._seen[ids])[:, None, None]
+        expected = self._uv[ids] + elapsed * self._moves[ids]
+        uv, contrast, good = expected.copy(), self._contrast[ids], np.ones(len(ids), bool)
         for c, image in enumerate(images):
-            spots, contrast = find_spots(image.grey, self.diameter)
-            gaps = _distances(last.uv[:, c] + self._velocity[:, c], spots)
-            change = np.abs(np.log(contrast) - np.log(known[last.ids, c])[:, None])
+            spots, levels = find_spots(image.grey, self.diameter)
+            gaps = _distances(expected[:, c], spots)
+            change = np.abs(np.log(levels) - np.log(contrast[:, c])[:, None])
             gaps[change > np.log(_MAX_CONTRAST_RATIO)] = np.inf
             index = nearest_spots(gaps, self.settings.reach)
             good &= index >= 0
             if len(spots):
-                uv[:, c], known[last.ids, c] = spots[index], contrast[index]
-        uv = uv[good]
+                uv[:, c], contrast[:, c] = spots[index], levels[index]
         found = self._locate(uv, np.tile(_CENTROID_VARIANCE * np.eye(2), (*uv.shape[:2], 1, 1)))
-        meet = found.parallax <= _MAX_RAY_GAP_PX
-        kept = last.only(good)
-        points = SurfacePoints(kept.ids, found.x_world, found.covariance, uv, kept.deformation)
-        return points.only(meet), (uv - kept.uv)[meet]
+        good &= found.parallax <= _MAX_RAY_GAP_PX
+        ids, uv, elapsed = ids[good], uv[good], elapsed[good]
+        moves = (uv - self._uv[ids]) / elapsed
+        self._uv[ids], self._moves[ids], self._contrast[ids], self._seen[ids] = uv, moves, contrast[good], frame
+        points = SurfacePoints(ids, found.x_world[good], found.covariance[good], uv, self._identities(len(ids)))
+        return points, moves
 
     def _regenerate(self, images: Sequence[SplineImage], points: SurfacePoints) -> SurfacePoints:
         if self.mask is not None:
@@ -122,9 +129,15 @@ class BrightPointTracker(SurfaceTracker):
         for c in range(len(self.rig)):
             _, spot, count = np.unique(combined[good, c], axis=0, return_inverse=True, return_counts=True)
             good[good] = count[spot.ravel()] == 1
-        maps = np.tile(np.eye(2), (int(good.sum()), len(self.rig) - 1, 1, 1))
-        ids = self._new_ids(len(maps))
-        return SurfacePoints(ids, found.x_world[good], found.covariance[good], combined[good], maps)
+        uv, ids = combined[good], self._new_ids(int(good.sum()))
+        known = (uv, np.zeros_like(uv), np.full(uv.shape[:2], np.nan), np.full(len(uv), len(self._frames)))
+        for name, values in zip(("_uv", "_moves", "_contrast", "_seen"), known):
+            setattr(self, name, np.concatenate([getattr(self, name), values]))
+        return SurfacePoints(ids, found.x_world[good], found.covariance[good], uv, self._identities(len(uv)))
+
+    def _identities(self, count: int) -> NDArray:
+        """Maps between views (count, C - 1, 2, 2), of which centroids tell nothing."""
+        return np.tile(np.eye(2), (count, len(self.rig) - 1, 1, 1))
 
     def _combined(self, spots: Sequence[NDArray]) -> NDArray:
         """(N, C, 2) [px] every spot of the first view with every one of the second, and those nearest in the others."""

@@ -25,7 +25,7 @@ from kinefit.motion import Motion
 from kinefit.photogrammetry.intersection import Intersections, intersect
 from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches, match
 from kinefit.photogrammetry.matching.multi_image import Correlations, search_box
-from kinefit.photogrammetry.one_camera import BODY_SIGMA, Depth, at_depth, body_depth, plane_depth
+from kinefit.photogrammetry.one_camera import BODY_SIGMA, Ranges, at_range, body_ranges, plane_ranges
 from kinefit.photogrammetry.region_growing import MIN_CORRELATION, Grid, Seeds
 from kinefit.photogrammetry.returning import PointReturn, Vanished
 from kinefit.photogrammetry.spline_image import SplineImage
@@ -117,12 +117,12 @@ class SurfaceTracker:
     _velocity: NDArray = field(default_factory=lambda: np.zeros((0, 0, 2)))
     _next: int = 0
     _vanished: Vanished | None = None
-    _depth: Depth | None = None
+    _ranges: Ranges | None = None
 
     def __post_init__(self) -> None:
         if len(self.rig) == 1:
             camera = self.rig.cameras[0]
-            self._depth = plane_depth(camera) if self.motion is None else body_depth(self.motion, camera)
+            self._ranges = plane_ranges(camera) if self.motion is None else body_ranges(self.motion, camera)
         if self.motion is not None:
             self._vanished = Vanished(self.rig, self.motion, self.settings.window)
 
@@ -147,7 +147,7 @@ class SurfaceTracker:
         self._velocity = np.zeros_like(points.uv) if velocity is None else velocity
         if velocity is not None and self._vanished is not None:
             points = self._append(points, self._reidentify(images, points))
-        if velocity is not None and self.settings.regenerate and self._depth is None:
+        if velocity is not None and self.settings.regenerate and self._ranges is None:
             points = self._append(points, self._regenerate(images, points))
         self._images = images
         self._frames.append(points)
@@ -184,7 +184,7 @@ class SurfaceTracker:
     def _measure_first(self, images: Sequence[SplineImage]) -> SurfacePoints:
         settings = self.settings
         grid = Grid.of(images[0].size, settings.step, margin=settings.window // 2 + 2, mask=self.mask)
-        if self._depth is not None:
+        if self._ranges is not None:
             return self._placed(grid.points[grid.inside])
         surface = measure(
             self.rig, images, grid, seeds=self.seeds, window=settings.window, least=settings.least, constrained=False
@@ -204,11 +204,11 @@ class SurfaceTracker:
 
     def _locate(self, uv: NDArray, covariance: NDArray) -> Intersections:
         """Places in space of image points (N, C, 2) [px] of the next frame, with covariances (N, C, 2, 2) [px²]."""
-        if self._depth is None:
+        if self._ranges is None:
             return intersect(self.rig, uv, covariance)
         sigma = 0.0 if self.motion is None else BODY_SIGMA
-        depth = self._depth(len(self._frames), uv[:, 0])
-        return at_depth(self.rig.cameras[0], uv[:, 0], covariance[:, 0], depth, sigma)
+        ranges = self._ranges(len(self._frames), uv[:, 0])
+        return at_range(self.rig.cameras[0], uv[:, 0], covariance[:, 0], ranges, sigma)
 
     def _new_ids(self, count: int) -> NDArray[np.int64]:
         """(count,) ids of new points."""
@@ -274,7 +274,7 @@ class SurfaceTracker:
 
     def _is_confirmed(self, old: SplineImage, new: SplineImage, box: Correlations, found: Matches) -> NDArray[np.bool_]:
         """(N,) which matches of a single camera are unique in their box and lead back to where they came from."""
-        if self._depth is None:
+        if self._ranges is None:
             return np.ones(len(found.uv), bool)
         inverse = np.linalg.pinv(np.nan_to_num(found.deformation))
         back = match(new, old, found.uv, found.points, deformation=inverse, window=self.settings.window)
