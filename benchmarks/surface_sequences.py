@@ -4,7 +4,7 @@ Of the places that the first image offers, a point is *right* at the end of a se
 it, *said* if its path ended before, and *unsaid* if it is still reported and is somewhere else. References: the known
 displacement of the DIC Challenge (0.1 px; sequence of its four images there and back); of MultiDIC's cylinder its rigid
 motion, fitted to every second point and asked of the others (0.1 mm); of clothes and skin in one camera a match of a
-window of 41 px, twice as wide as the tracker's, from the first image straight to the last one, started where the
+window of 41 px, wider than the tracker's 31, from the first image straight to the last one, started where the
 neighbours went (2 px). Where it finds nothing the point is *unjudged*. Limits of one camera were chosen on cam02 of the
 two people, figures are of cam01, cam03 and of two other recordings. The person with shirt and jeans was composited into
 the images by its authors. Bright spheres: drawn ones with noise and shading against their true centres, and the real
@@ -40,7 +40,7 @@ from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.readers.video import Video
 
 RATE = 60.0  # [Hz] that videos are written with
-JUDGE, AROUND = 41, 60.0  # window and distance of neighbours [px]
+SIDE, JUDGE, AROUND = 31, 41, 60.0  # windows of clothes and of their judge, distance of neighbours [px]
 RIGHT_PX, RIGHT_DIC_PX, RIGHT_M, RIGHT_MARK_PX = 2.0, 0.1, 1e-4, 4.0
 KINDS = {"right": ">= 80", "said": "<= 20", "unsaid": "<= 1"}
 
@@ -76,8 +76,8 @@ SEATED: Marks = (
     (250, 1058, 249.5, 1057), (386, 1116, 386.5, 1115),
 )  # fmt: skip
 SPHERES = {
-    "back": ("video_balancing_4cam/videos/cam03.mp4", 20, 10, 12, BACK),
-    "seated": ("video_mono_opencap/STS/video.mp4", 60, 8, 12, SEATED),
+    "back": ("video_balancing_4cam/videos/cam03.mp4", 20, 12, 8, BACK),
+    "seated": ("video_mono_opencap/STS/video.mp4", 60, 10, 8, SEATED),
 }
 """Video, last image, widest spot [px], reach [px], marks."""
 
@@ -172,7 +172,7 @@ def _challenge(work: Path) -> None:
     ids, x = _paths(work / "dic", len(order))
     end = _all(len(places), ids, _in_pixels(x[-1]))
     truth = np.loadtxt(folder / "command.csv", delimiter=",")
-    shift = np.interp(places[:, 0], truth[:, 0], truth[:, 3])
+    shift = np.interp(places[:, 0], truth[:, 0], truth[:, 5])
     off = np.linalg.norm(end - places - np.column_stack([shift, np.zeros(len(shift))]), axis=1)
     live = np.isfinite(off)
     print(f"# challenge: {np.sqrt(np.mean(off[live] ** 2)):.3f} px RMS, worst {off[live].max():.3f}")
@@ -231,10 +231,10 @@ def _cloth(work: Path, name: str) -> None:
     size = images[0].shape[1::-1]
     _write_video(work / "cloth.avi", images)
     _mask(work / "mask.png", size, cloth.box)
-    options = ["--flat", 1, "--window", 21, "--step", step, "--reach", 12, "--mask", work / "mask.png"]
+    options = ["--flat", 1, "--window", SIDE, "--step", step, "--reach", 12, "--mask", work / "mask.png"]
     _call("surface", work / "cloth.avi", *options, "-o", work / name)
     mask = cv2.imread(str(work / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0
-    grid = Grid.of(size, step, margin=12, mask=mask)
+    grid = Grid.of(size, step, margin=SIDE // 2 + 2, mask=mask)
     places = grid.points[grid.inside]
     ids, x = _paths(work / name, len(images))
     end = _all(len(places), ids, _in_pixels(x[-1]))
@@ -276,7 +276,7 @@ def _help(work: Path) -> None:
         images = [video.read(k)[..., ::-1].copy() for k in range(count)]
     _write_video(work / "man.avi", images)
     _mask(work / "mask.png", images[0].shape[1::-1], box)
-    options = ["--window", 21, "--step", 8, "--reach", 12, "--mask", work / "mask.png"]
+    options = ["--window", SIDE, "--step", 8, "--reach", 12, "--mask", work / "mask.png"]
     calibration = [folder / "Calib_refined_static.toml", f"{camera}={work / 'man.avi'}", "--unit", "m"]
     _call("surface", *calibration, "--motion", work / "motion", *options, "-o", work / "on")
     print("#", _call("surface", work / "man.avi", "--flat", 1, *options, "-o", work / "off").splitlines()[0])

@@ -7,7 +7,7 @@ visible, from their neighbours. If a body's motion is known, lost points are re-
 view (`returning`).
 
 One camera has no match between views as a check. There a point is matched back to the image before, and no other place
-of the search box may look alike; its place in space is on the plane z = 0, or on the body whose motion is given
+of the search box may look alike. Then it is matched from its first image, so that errors do not add up. Its place in space is on the plane z = 0, or on the body whose motion is given
 (`one_camera`).
 """
 
@@ -38,7 +38,7 @@ _MAX_RETURN_SHARE = 0.5  # of `reach`: distance of a re-identified point from it
 _MAX_SEARCH_ROUNDS = 20  # in which a motion spreads from point to point
 _EXACT_VARIANCE = 1e-6  # [px²] of the points in the first image, which are exact by definition
 _MAX_BACKWARD_PX = 0.2  # of one camera: distance of a point that is matched back from where it came
-_MAX_RUNNER_UP_RATIO = 0.9  # of one camera: second-best correlation in a search box to the best
+_MAX_RUNNER_UP_RATIO = 0.95  # of one camera: second-best correlation in a search box to the best
 
 
 @dataclass(frozen=True)
@@ -118,6 +118,8 @@ class SurfaceTracker:
     _next: int = 0
     _vanished: Vanished | None = None
     _ranges: Ranges | None = None
+    _first: Sequence[SplineImage] = ()
+    _maps: NDArray = field(default_factory=lambda: np.zeros((0, 2, 2)))
 
     def __post_init__(self) -> None:
         if len(self.rig) == 1:
@@ -185,6 +187,7 @@ class SurfaceTracker:
         settings = self.settings
         grid = Grid.of(images[0].size, settings.step, margin=settings.window // 2 + 2, mask=self.mask)
         if self._ranges is not None:
+            self._first = images
             return self._placed(grid.points[grid.inside])
         surface = measure(
             self.rig, images, grid, seeds=self.seeds, window=settings.window, least=settings.least, constrained=False
@@ -198,8 +201,8 @@ class SurfaceTracker:
         covariance = np.tile(_EXACT_VARIANCE * np.eye(2), (len(uv), 1, 1, 1))
         found = self._locate(uv[:, None], covariance)
         index = np.flatnonzero(np.isfinite(found.parallax))
-        maps = np.zeros((len(index), 0, 2, 2))
-        ids = self._new_ids(len(index))
+        maps, ids = np.zeros((len(index), 0, 2, 2)), self._new_ids(len(index))
+        self._maps = np.tile(np.eye(2), (len(index), 1, 1))
         return SurfacePoints(ids, found.x_world[index], found.covariance[index], uv[index, None], maps)
 
     def _locate(self, uv: NDArray, covariance: NDArray) -> Intersections:
@@ -239,6 +242,8 @@ class SurfaceTracker:
             for values, found in zip((uv, own, velocity, maps, good), matches):
                 values[lost] = found
         points, uv, own, velocity, maps = last.only(good), uv[good], own[good], velocity[good], maps[good]
+        if self._ranges is not None:
+            self._anchor(images[0], points, uv[:, 0], own[:, 0])
         meet = self._locate(uv, own)
         agree = meet.parallax <= max_parallax(meet.parallax)
         return SurfacePoints(points.ids, meet.x_world, meet.covariance, uv, maps).only(agree), velocity[agree]
@@ -271,6 +276,18 @@ class SurfaceTracker:
         for c in range(1, len(images)):
             good[index] &= self._match_spatially(images, c, index, uv, covariance, maps)
         return uv, covariance, velocity, maps, good
+
+    def _anchor(self, image: SplineImage, points: SurfacePoints, uv: NDArray, covariance: NDArray) -> None:
+        """Replace image points (M, 2) [px] of a single camera by those of their windows in its first image.
+
+        So errors of the steps do not add up. Points that look different by now, or are further off, stay as they are.
+        """
+        settings, begin = self.settings, self._frames[0].uv[points.ids, 0]
+        found = match(self._first[0], image, begin, uv, deformation=self._maps[points.ids], window=settings.window)
+        near = np.linalg.norm(found.uv - uv, axis=1) <= settings.agreement
+        good = found.found & (found.correlation >= settings.least) & near
+        uv[good], covariance[good] = found.uv[good], found.covariance[good]
+        self._maps[points.ids[good]] = found.deformation[good]
 
     def _is_confirmed(self, old: SplineImage, new: SplineImage, box: Correlations, found: Matches) -> NDArray[np.bool_]:
         """(N,) which matches of a single camera are unique in their box and lead back to where they came from."""
