@@ -57,7 +57,7 @@ class Cloth:
 
 TWO, FRAMES = "video_two_people_4cam", amount(21, 4)
 CLOTHES = {
-    "shirt": Cloth(f"{TWO}/cam01.mp4", (780, 960, 930, 1180)),
+    "shirt": Cloth(f"{TWO}/cam01.mp4", (780, 1010, 930, 1180)),
     "jeans": Cloth(f"{TWO}/cam01.mp4", (650, 1335, 800, 1440)),
     "skin": Cloth(f"{TWO}/cam03.mp4", (585, 570, 720, 800)),
     "singlet": Cloth("video_mono_opencap/STS/video.mp4", (296, 765, 366, 850), 0, 3),

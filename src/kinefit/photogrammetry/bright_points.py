@@ -47,13 +47,23 @@ def find_spots(grey: NDArray, diameter: int) -> tuple[NDArray, NDArray]:
         left, top, width, height, area = boxes[k]
         if area < _MIN_PIXELS or max(width, height) > min(diameter, _MAX_ASPECT * min(width, height)):
             continue
-        rows, columns = (slice(max(a - 1, 0), a + n + 1) for a, n in ((top, height), (left, width)))
-        own = cv2.dilate((labels[rows, columns] == k).astype(np.uint8), np.ones((3, 3), np.uint8))
-        moments = cv2.moments(risen[rows, columns] * own)
-        middle = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
-        uv.append(middle + (columns.start, rows.start))
-        contrast.append(float(risen[top : top + height, left : left + width].max()))
+        rows, columns = (slice(max(a - diameter, 0), a + n + diameter) for a, n in ((top, height), (left, width)))
+        own, around = labels[rows, columns] == k, grey[rows, columns]
+        level = float(risen[rows, columns][own].max())
+        if _is_part_of_larger(around > around[own].max() - _LEVEL * level, own, diameter):
+            continue
+        weight = risen[rows, columns] * cv2.dilate(own.astype(np.uint8), np.ones((3, 3), np.uint8))
+        moments = cv2.moments(weight)
+        uv.append(np.array([moments["m10"], moments["m01"]]) / moments["m00"] + (columns.start, rows.start))
+        contrast.append(level)
     return np.array(uv).reshape(-1, 2), np.array(contrast)
+
+
+def _is_part_of_larger(bright: NDArray, own: NDArray, diameter: int) -> bool:
+    """Whether the spot `own` (H, W) lies on a bright region wider than `diameter` [px], as the corner of a box does."""
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(bright.astype(np.uint8), connectivity=8)
+    sizes = boxes[np.unique(labels[own & bright])][:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
+    return bool((sizes > diameter).any())
 
 
 @dataclass(eq=False)
@@ -61,8 +71,9 @@ class BrightPointTracker(SurfaceTracker):
     """Tracks bright points through images of synchronised cameras: `update` once per frame, `trajectories` at the end.
 
     A point is predicted linearly in every image and found at the spot that is nearest to its prediction, if no other
-    point and no other spot is about as near. It may be missed in five frames. The rays of all views must meet. Spots that belong to no point are
-    associated between the views by their rays, if only one combination fits, and become new points.
+    point and no other spot is about as near. It may be missed in five frames. The rays of all views must meet. Spots
+    that belong to no point are associated between the views by their rays, if only one combination fits, and become new
+    points.
 
     Parameters
     ----------
@@ -162,10 +173,10 @@ def nearest_spots(gaps: NDArray, reach: float) -> NDArray[np.int64]:
     best = gaps.argmin(axis=1)[:-1]
     least = gaps[np.arange(len(best)), best]
     next_spot = np.partition(gaps[:-1], 1, axis=1)[:, 1]
-    gaps[np.arange(len(best)), best] = np.inf
-    next_place = gaps[:, best].min(axis=0) if len(best) else least
-    sure = (least <= reach) & (least <= _MAX_AMBIGUITY * np.minimum(next_spot, next_place))
-    return np.where(sure, best, -1)
+    others = gaps[:, best]
+    others[np.arange(len(best)), np.arange(len(best))] = np.inf
+    is_clear = least <= _MAX_AMBIGUITY * np.minimum(next_spot, others.min(axis=0))
+    return np.where((least <= reach) & is_clear, best, -1)
 
 
 def _distances(one: NDArray, other: NDArray) -> NDArray:

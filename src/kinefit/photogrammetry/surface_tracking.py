@@ -38,6 +38,7 @@ _MAX_RETURN_SHARE = 0.5  # of `reach`: distance of a re-identified point from it
 _MAX_SEARCH_ROUNDS = 20  # in which a motion spreads from point to point
 _EXACT_VARIANCE = 1e-6  # [px²] of the points in the first image, which are exact by definition
 _MAX_BACKWARD_PX = 0.2  # of one camera: distance of a point that is matched back from where it came
+_MAX_ANCHOR_GAP_PX = 2.0  # of one camera: distance of a point from where its window of the first image matches
 _MAX_RUNNER_UP_RATIO = 0.95  # of one camera: second-best correlation in a search box to the best
 
 
@@ -241,9 +242,9 @@ class SurfaceTracker:
             matches = self._match_temporally(images, last.only(lost), shift)
             for values, found in zip((uv, own, velocity, maps, good), matches):
                 values[lost] = found
-        points, uv, own, velocity, maps = last.only(good), uv[good], own[good], velocity[good], maps[good]
         if self._ranges is not None:
-            self._anchor(images[0], points, uv[:, 0], own[:, 0])
+            good[good] = self._anchor(images[0], last.ids[good], uv, own, good)
+        points, uv, own, velocity, maps = last.only(good), uv[good], own[good], velocity[good], maps[good]
         meet = self._locate(uv, own)
         agree = meet.parallax <= max_parallax(meet.parallax)
         return SurfacePoints(points.ids, meet.x_world, meet.covariance, uv, maps).only(agree), velocity[agree]
@@ -277,17 +278,22 @@ class SurfaceTracker:
             good[index] &= self._match_spatially(images, c, index, uv, covariance, maps)
         return uv, covariance, velocity, maps, good
 
-    def _anchor(self, image: SplineImage, points: SurfacePoints, uv: NDArray, covariance: NDArray) -> None:
-        """Replace image points (M, 2) [px] of a single camera by those of their windows in its first image.
+    def _anchor(
+        self, image: SplineImage, ids: NDArray, uv: NDArray, covariance: NDArray, good: NDArray
+    ) -> NDArray[np.bool_]:
+        """(K,) which points `ids` (K,) of a single camera still look as in its first image.
 
-        So errors of the steps do not add up. Points that look different by now, or are further off, stay as they are.
+        Replaces the image points (M, C, 2) [px] of `good` (M,) by those of their windows in the first image, so that
+        errors of the steps do not add up; points that are further off than `agreement` stay as they are.
         """
-        settings, begin = self.settings, self._frames[0].uv[points.ids, 0]
-        found = match(self._first[0], image, begin, uv, deformation=self._maps[points.ids], window=settings.window)
-        near = np.linalg.norm(found.uv - uv, axis=1) <= settings.agreement
-        good = found.found & (found.correlation >= settings.least) & near
-        uv[good], covariance[good] = found.uv[good], found.covariance[good]
-        self._maps[points.ids[good]] = found.deformation[good]
+        settings, begin, at = self.settings, self._frames[0].uv[ids, 0], np.flatnonzero(good)
+        found = match(self._first[0], image, begin, uv[at, 0], deformation=self._maps[ids], window=settings.window)
+        gap = np.linalg.norm(found.uv - uv[at, 0], axis=1)
+        alike = found.found & (found.correlation >= settings.least) & (gap <= _MAX_ANCHOR_GAP_PX)
+        near = alike & (gap <= settings.agreement)
+        uv[at[near], 0], covariance[at[near], 0] = found.uv[near], found.covariance[near]
+        self._maps[ids[near]] = found.deformation[near]
+        return np.asarray(alike)
 
     def _is_confirmed(self, old: SplineImage, new: SplineImage, box: Correlations, found: Matches) -> NDArray[np.bool_]:
         """(N,) which matches of a single camera are unique in their box and lead back to where they came from."""
