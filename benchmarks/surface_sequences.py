@@ -186,7 +186,7 @@ def _cylinder(work: Path) -> None:
         return
     photographs = {n: [cv2.imread(str(folder / "speckledObjectImages" / n / f"{n}_{k}.jpg")) for k in (1, 2, 3)]
                    for n in CAMERAS}  # fmt: skip
-    mask, order = np.zeros(CYLINDER_SIZE[::-1], bool), amount((0, 1, 2, 1, 0, 2, 0, 1, 0, 2), (0, 1, 2))
+    mask, order = np.zeros(CYLINDER_SIZE[::-1], bool), amount((0, 1, 2, 1, 0, 2, 1, 0, 1, 2), (0, 1, 2))
     mask[SPECKLE] = True
     grid = Grid.of(CYLINDER_SIZE, 24, mask=mask, margin=30)
     objects = [calibration_object(folder, name) for name in CAMERAS]

@@ -38,7 +38,9 @@ def test_centroids_are_right_to_a_tenth_of_a_pixel(diameter):
 def test_wide_long_and_faint_spots_are_none():
     rng = np.random.default_rng(0)
     image = drawn([(50, 50)], rng, noise=0.5)
-    image[100:103, 40:60], image[90:120, 120:150], image[30:33, 150:153] = 200, 200, image[30:33, 150:153] + 8
+    u, v = scenes.pixels(SIZE).T.reshape(2, *SIZE[::-1])
+    image[np.hypot(u - 140, v - 100) < 15] = 200
+    image[100:103, 40:60], image[30:33, 150:153] = 200, image[30:33, 150:153] + 8
     uv, _ = find_spots(image, 12)
     np.testing.assert_allclose(uv, [(50, 50)], atol=0.1)
 

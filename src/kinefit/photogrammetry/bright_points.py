@@ -30,7 +30,7 @@ _MAX_AMBIGUITY = 0.5  # distance of the nearest spot to that of the next
 
 
 def find_spots(grey: NDArray, diameter: int) -> tuple[NDArray, NDArray]:
-    """Bright compact spots of an image (H, W) of grey values, at most `diameter` [px] wide.
+    """Bright compact spots of an image (H, W) of grey values, at most `diameter` [px] wide; corners of areas, too.
 
     Returns
     -------
@@ -47,23 +47,13 @@ def find_spots(grey: NDArray, diameter: int) -> tuple[NDArray, NDArray]:
         left, top, width, height, area = boxes[k]
         if area < _MIN_PIXELS or max(width, height) > min(diameter, _MAX_ASPECT * min(width, height)):
             continue
-        rows, columns = (slice(max(a - diameter, 0), a + n + diameter) for a, n in ((top, height), (left, width)))
-        own, around = labels[rows, columns] == k, grey[rows, columns]
-        level = float(risen[rows, columns][own].max())
-        if _is_part_of_larger(around > around[own].max() - _LEVEL * level, own, diameter):
-            continue
+        rows, columns = (slice(max(a - 1, 0), a + n + 1) for a, n in ((top, height), (left, width)))
+        own = labels[rows, columns] == k
         weight = risen[rows, columns] * cv2.dilate(own.astype(np.uint8), np.ones((3, 3), np.uint8))
         moments = cv2.moments(weight)
         uv.append(np.array([moments["m10"], moments["m01"]]) / moments["m00"] + (columns.start, rows.start))
-        contrast.append(level)
+        contrast.append(float(risen[rows, columns][own].max()))
     return np.array(uv).reshape(-1, 2), np.array(contrast)
-
-
-def _is_part_of_larger(bright: NDArray, own: NDArray, diameter: int) -> bool:
-    """Whether the spot `own` (H, W) lies on a bright region wider than `diameter` [px], as the corner of a box does."""
-    _, labels, boxes, _ = cv2.connectedComponentsWithStats(bright.astype(np.uint8), connectivity=8)
-    sizes = boxes[np.unique(labels[own & bright])][:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
-    return bool((sizes > diameter).any())
 
 
 @dataclass(eq=False)
