@@ -198,7 +198,7 @@ def _cylinder(work: Path) -> None:
         _write_video(work / f"{name}.avi", [photographs[name][k] for k in order])
     views = [f"{name}={work / name}.avi" for name in CAMERAS]
     options = ["--mask", work / "mask.png", "--window", WINDOW, "--step", 24, "-o", work / "cylinder"]
-    _call("surface", work / "calib.toml", *views, *options)
+    print("#", _call("surface", work / "calib.toml", *views, *options).splitlines()[:3])
     ids, x = _paths(work / "cylinder", len(order))
     begun = np.isfinite(x[0, :, 0])
     first, last = x[0, begun], x[-1, begun]
