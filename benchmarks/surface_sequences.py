@@ -5,11 +5,11 @@ it, *said* if its path ended before, and *unsaid* if it is still reported and is
 displacement of the DIC Challenge (0.1 px; sequence of its four images there and back); of MultiDIC's cylinder its rigid
 motion, fitted to every second point and asked of the others (0.1 mm); of clothes and skin in one camera a match of a
 window of 41 px, wider than the tracker's 31, from the first image straight to the last one, started where the
-neighbours went (2 px). Where it finds nothing the point is *unjudged*. Limits of one camera were chosen on cam02 of the
-two people, figures are of cam01, cam03 and of two other recordings. The person with shirt and jeans was composited into
-the images by its authors. Bright spheres: drawn ones with noise and shading against their true centres, and the real
-ones on a back and a seated person, of which each was marked by hand in the first image; back through the reversed
-video is their check.
+neighbours went (2 px). Where it finds nothing the point is *unjudged*. Limits of one camera were chosen on cam02 and
+cam04 of the two people, of spheres on the back; figures are of cam01, cam03, of two other recordings and the seated.
+The person with shirt and jeans was composited into the images by its authors. Bright spheres: drawn ones with noise and
+shading against their true centres, and the real ones on a back and on a seated person who stands up, whose centres in
+the first and last image were read by eye (4 px).
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ def _cylinder(work: Path) -> None:
         return
     photographs = {n: [cv2.imread(str(folder / "speckledObjectImages" / n / f"{n}_{k}.jpg")) for k in (1, 2, 3)]
                    for n in CAMERAS}  # fmt: skip
-    mask, order = np.zeros(CYLINDER_SIZE[::-1], bool), amount((0, 1, 2, 1, 0, 2, 1, 0, 1, 2), (0, 1, 2))
+    mask = np.zeros(CYLINDER_SIZE[::-1], bool)
     mask[SPECKLE] = True
     grid = Grid.of(CYLINDER_SIZE, 24, mask=mask, margin=30)
     objects = [calibration_object(folder, name) for name in CAMERAS]
@@ -195,11 +195,11 @@ def _cylinder(work: Path) -> None:
     write_calibration(adjusted(rig, objects, start.uv[start.measured]), work / "calib.toml")
     cv2.imwrite(str(work / "mask.png"), mask.astype(np.uint8) * 255)
     for name in CAMERAS:
-        _write_video(work / f"{name}.avi", [photographs[name][k] for k in order])
+        _write_video(work / f"{name}.avi", photographs[name])
     views = [f"{name}={work / name}.avi" for name in CAMERAS]
     options = ["--mask", work / "mask.png", "--window", WINDOW, "--step", 24, "-o", work / "cylinder"]
-    print("#", _call("surface", work / "calib.toml", *views, *options).splitlines()[:3])
-    ids, x = _paths(work / "cylinder", len(order))
+    _call("surface", work / "calib.toml", *views, *options)
+    _, x = _paths(work / "cylinder", 3)
     begun = np.isfinite(x[0, :, 0])
     first, last = x[0, begun], x[-1, begun]
     live = np.isfinite(last[:, 0])
@@ -210,7 +210,9 @@ def _cylinder(work: Path) -> None:
         T, _ = rigid_motion(first[both], last[both])
         off[half] = np.linalg.norm(first[half] @ T[:3, :3].T + T[:3, 3] - last[half], axis=1)
     print(f"# cylinder: {1e3 * np.sqrt(np.mean(off[live] ** 2)):.4f} mm RMS, worst {1e3 * off[live].max():.4f}")
-    _report("cylinder", off <= RIGHT_M, live, live)
+    never = np.zeros(max(0, int(start.measured.sum()) - len(live)), bool)  # measured at first, and cut off at once
+    live, right = np.append(live, never), np.append(off <= RIGHT_M, never)
+    _report("cylinder", right, live, live)
 
 
 def _frames(cloth: Cloth) -> list[NDArray] | None:
@@ -279,7 +281,10 @@ def _help(work: Path) -> None:
     options = ["--window", SIDE, "--step", 8, "--reach", 12, "--mask", work / "mask.png"]
     calibration = [folder / "Calib_refined_static.toml", f"{camera}={work / 'man.avi'}", "--unit", "m"]
     _call("surface", *calibration, "--motion", work / "motion", *options, "-o", work / "on")
-    print("#", _call("surface", work / "man.avi", "--flat", 1, *options, "-o", work / "off").splitlines()[0])
+    _call("surface", work / "man.avi", "--flat", 1, *options, "-o", work / "off")
+    for name in ("off", "on"):
+        live = np.isfinite(_paths(work / name, count)[1][..., 0]).sum(axis=1)
+        print(f"# help {name}: {live[0]} points at first, {live[count // 2]} in the middle, {live[-1]} at the end")
     ids, x = _paths(work / "on", count)
     view, splines = read_calibration(folder / "Calib_refined_static.toml", unit="m")[camera], {}
     with (work / "on" / "returns.csv").open() as lines:

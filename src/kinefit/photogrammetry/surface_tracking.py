@@ -7,8 +7,8 @@ visible, from their neighbours. If a body's motion is known, lost points are re-
 view (`returning`).
 
 One camera has no match between views as a check. There a point is matched back to the image before, and no other place
-of the search box may look alike. Then it is matched from its first image, so that errors do not add up. Its place in space is on the plane z = 0, or on the body whose motion is given
-(`one_camera`).
+of the search box may look alike. Then it is matched from its first image, so that errors do not add up. Its place in
+space is on the plane z = 0, or on the body whose motion is given (`one_camera`).
 """
 
 from __future__ import annotations

@@ -97,20 +97,16 @@ def uniform(paths: Trajectories, *, radius: float, frames: int = 1, limit: float
     ----------
     radius : [m] of the neighbourhood
     frames : number of frames before and after that belong to it
-    limit : [m/s] of the difference; default: five robust standard deviations of all differences, or of the points'
-        noise if that is larger
+    limit : [m/s] of the difference; default: five robust standard deviations of all differences
     """
     off = _velocity_deviations(paths, radius, frames)
-    return paths.live & ~(off > (_outlier_limit(off, paths) if limit is None else limit))
+    return paths.live & ~(off > (_outlier_limit(off) if limit is None else limit))
 
 
-def _outlier_limit(off: NDArray, paths: Trajectories) -> float:
-    """[m/s] five standard deviations of differences: robust ones of all, or those of the points' noise if larger."""
+def _outlier_limit(off: NDArray) -> float:
+    """[m/s] five robust standard deviations of differences."""
     known = off[np.isfinite(off)]
-    if not len(known):
-        return np.inf
-    noise = np.nanmedian(np.linalg.norm(paths.std, axis=2)) / (np.sqrt(2.0) * np.diff(paths.times).mean())
-    return float(_OUTLIER_SIGMAS * max(1.4826 * np.median(known), noise))
+    return float(_OUTLIER_SIGMAS * 1.4826 * np.median(known)) if len(known) else np.inf
 
 
 def _velocity_deviations(paths: Trajectories, radius: float, frames: int) -> NDArray:
@@ -193,7 +189,7 @@ def filtered(
     limit = None
     for _ in range(_MAX_ROUNDS if neighbours else int(uniformity)):
         off = _velocity_deviations(kept, radius, 1)
-        limit = _outlier_limit(off, kept) if limit is None else limit
+        limit = _outlier_limit(off) if limit is None else limit
         if not cut("uniformity", kept.live & ~(off > limit)):
             break
     if neighbours:

@@ -310,7 +310,8 @@ def moved_texture(path, sphere=False):
 
 def read_paths(file):
     with file.open() as lines:
-        return [{name: float(value) if value else np.nan for name, value in row.items()} for row in csv.DictReader(lines)]
+        rows = list(csv.DictReader(lines))
+    return [{name: float(value) if value else np.nan for name, value in row.items()} for row in rows]
 
 
 def test_one_video_of_a_flat_surface_is_followed(tmp_path):

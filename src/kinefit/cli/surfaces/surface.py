@@ -49,7 +49,7 @@ Examples:
     "--bright", type=click.IntRange(3), metavar="PX",
     help="Videos: track bright points (retroreflective spheres), at most PX wide, by their centroids.",
 )  # fmt: skip
-@click.option("--reach", type=click.IntRange(1), metavar="PX", help="Videos: half side of the search box.  [default: 8]")
+@click.option("--reach", type=click.IntRange(1), metavar="PX", help="Videos: half side of search boxes.  [default: 8]")
 @click.option("--neighbours", is_flag=True, help="Videos: also reject points whose neighbours were rejected.")
 @click.option("--field", type=click.Choice(["odd", "even"]), help="Interlaced images: use only these lines.")
 @_screen.verbose_option
