@@ -297,7 +297,8 @@ def _help(work: Path) -> None:
             continue  # cut off by the filters
         before, after = (view.project(x[k, column]) for k in (lost - 1, found))
         for k in (lost - 1, found):
-            splines.setdefault(k, SplineImage.of(images[k][..., ::-1]))
+            if k not in splines:
+                splines[k] = SplineImage.of(images[k][..., ::-1])
         off.append(judged(splines[lost - 1], splines[found], before, after)[0])
     known = np.isfinite(off)
     print(f"# {len(rows)} points found again, {len(off)} after the filters, {int(known.sum())} of them judged")
