@@ -73,6 +73,7 @@ AREAS: dict[str, dict[str, str]] = {
         "video_bodies": "drawn videos and a bar recording through the commands, with nothing but clicked joints",
         "metaballs": "an arm of metaballs fitted to points",
         "surface_arm": "a bare arm before two cameras, tracked",
+        "surface_sequences": "real textured images that move: points followed, said to be lost, wrong; bright spheres",
         "surface_clothes": "skin and clothes of real people: followed in one camera, measured between two",
         "clicked": "poses from joints clicked in three images",
         "retarget": "recorded motions on other characters, in the Khronos validator",

@@ -46,6 +46,7 @@ NOT_RUN = {
     ("regions", "kinefit track"): "needs video and mesh of one object; tests/tracking/test_kinds.py has such takes",
     ("surfaces", "kinefit surface calib.toml a=a.mp4"): "minutes; tests/cli/surfaces/test_surface.py follows videos",
     ("surfaces", "kinefit surface calib.toml left=left.mp4"): "the same",
+    ("surfaces", "kinefit surface side.mp4"): "needs a video; tests/cli/surfaces/test_surface.py follows a drawn one",
     ("surfaces", "kinefit surface calib.toml 201"): "the same, with states",
     ("surfaces", "kinefit track"): "tests/tracking/test_surface_takes.py tracks such takes",
     ("sensors", "kinefit track"): "a minute; the robot's tutorial does it with ten images",

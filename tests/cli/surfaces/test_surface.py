@@ -292,3 +292,91 @@ def test_photographs_by_a_shell_s_pattern_are_in_the_order_of_their_numbers():
     chosen = [Path(f"load_{k}.png") for k in (3, 1, 2)]
     assert in_number_order(chosen) == chosen  # as somebody put them
     assert in_number_order([Path("after.png"), Path("before.png")])[0] == Path("after.png")
+
+
+def moved_texture(path, sphere=False):
+    """A video of six images of a texture that moves by (2, 1) px a frame, or of a bright sphere on it."""
+    rng, size = np.random.default_rng(4), (200, 150)
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), 30.0, size)
+    texture = scenes.Texture(1.5, 5, contrast=8.0 if sphere else 40.0)
+    for k in range(6):
+        at = scenes.pixels(size) - k * np.array([2.0, 1.0])
+        grey = texture(at) + rng.normal(size=len(at))
+        if sphere:
+            grey[np.hypot(*(at - (80, 60)).T) < 3] = 250
+        video.write(np.repeat(np.clip(grey, 0, 255).astype(np.uint8).reshape(*size[::-1], 1), 3, axis=2))
+    video.release()
+
+
+def read_paths(file):
+    with file.open() as lines:
+        rows = list(csv.DictReader(lines))
+    return [{name: float(value) if value else np.nan for name, value in row.items()} for row in rows]
+
+
+def test_one_video_of_a_flat_surface_is_followed(tmp_path):
+    moved_texture(tmp_path / "a.avi")
+    told = call(tmp_path / "a.avi", "--flat", 2.0, "--window", 17, "--step", 20, "--reach", 5, "-o", tmp_path / "out")
+    assert told.exit_code == 0, told.output
+    rows = read_paths(tmp_path / "out" / "trajectories.csv")
+    last = [row for row in rows if row["time_s"] == pytest.approx(5 / 30, abs=1e-5)]
+    assert len(last) > 20
+    for row in last:
+        start = next(other for other in rows if other["point"] == row["point"])
+        moved = np.array([row[axis] - start[axis] for axis in "xyz"]) / (row["time_s"] - start["time_s"])
+        np.testing.assert_allclose(moved, (0.12, -0.06, 0.0), atol=0.005)
+    assert (tmp_path / "out" / "paths_image.png").exists()
+
+
+def test_a_bright_sphere_is_followed_by_its_centroid(tmp_path):
+    moved_texture(tmp_path / "a.avi", sphere=True)
+    told = call(tmp_path / "a.avi", "--flat", 1.0, "--bright", 12, "-o", tmp_path / "out")
+    assert told.exit_code == 0, told.output
+    rows = read_paths(tmp_path / "out" / "trajectories.csv")
+    own = [row for row in rows if np.hypot(row["x"] - 0.08 - 0.06 * row["time_s"], row["y"] + 0.06) < 0.01]
+    assert len({row["point"] for row in own}) == 1 and len(own) == 6
+    for k, row in enumerate(own):
+        np.testing.assert_allclose((row["x"], row["y"]), (0.08 + 0.002 * k, -0.06 - 0.001 * k), atol=2e-4)
+
+
+def test_one_camera_follows_points_on_a_body_whose_motion_is_given(tmp_path):
+    from benchmarks.surface_body import cameras, moving_arm
+    from benchmarks.textured import textured_picture
+
+    from kinefit.bodies.surfaces.places import body_mesh, nearest
+    from kinefit.exporters.motion_file import write_motion
+    from kinefit.simulation.rendering.scenes import SimulatedScene
+
+    motion, camera = moving_arm(0, 5), cameras(320).cameras[0]
+    scene = SimulatedScene(motion, body_mesh(motion.body, around=64))
+    video = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.VideoWriter_fourcc(*"FFV1"), motion.rate, camera.size)
+    for k in range(5):
+        video.write(np.repeat(textured_picture(scene, k, camera, grain=0.005)[..., None], 3, axis=2))
+    video.release()
+    write_motion(motion, tmp_path / "motion.npz")
+    write_calibration(Rig((camera,)), tmp_path / "calib.toml")
+    words = [tmp_path / "calib.toml", f"{camera.name}={tmp_path / 'a.avi'}", "-o", tmp_path / "out"]
+    told = call(*words, "--motion", tmp_path / "motion.npz")
+    assert told.exit_code == 0, told.output
+    rows = read_paths(tmp_path / "out" / "trajectories.csv")
+    last = [row for row in rows if row["time_s"] == pytest.approx(4 / motion.rate, abs=1e-5)]
+    assert len(last) > 30 and (tmp_path / "out" / "returns.csv").exists()
+    x = np.array([[row[axis] for axis in "xyz"] for row in last])
+    gap = nearest(motion.body, motion.state(4), x, max_distance=1.0).distance
+    assert np.median(np.abs(gap)) < 1e-3 and gap.max() < 0.021
+    told = call(*words)
+    assert isinstance(told.exception, ObservationError) and "1 views" in str(told.exception)
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["{0}/a.avi", "--flat", "1", "--motion", "m.npz"], "need a calibration"),
+        (["{0}/calib.toml", "a={0}/a.avi", "b={0}/b.avi", "--bright", "9", "--motion", "m.npz"], "--bright has none"),
+        (["{0}/calib.toml", "a={0}/a", "b={0}/b", "--bright", "9"], "--bright needs videos"),
+        (["{0}/calib.toml", "a={0}/a", "b={0}/b", "--reach", "9"], "--reach needs videos"),
+    ],
+)
+def test_options_of_one_camera_and_bright_points_that_do_not_go_together(folder, tmp_path, words, text):
+    told = call(*(word.format(folder) for word in words), "-o", tmp_path / "out")
+    assert isinstance(told.exception, ObservationError) and text in str(told.exception)

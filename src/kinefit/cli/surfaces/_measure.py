@@ -30,8 +30,10 @@ from kinefit.exporters.surface_files import (
     write_velocity_picture,
 )
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.images.photogrammetry.bright_points import BrightPointTracker
 from kinefit.images.photogrammetry.flat import measure_flat
 from kinefit.images.photogrammetry.least_squares_matching import windows_by_texture
+from kinefit.images.photogrammetry.one_camera import flat_camera
 from kinefit.images.photogrammetry.region_growing import MIN_CORRELATION, Grid, Seeds
 from kinefit.images.photogrammetry.spline_image import SplineImage, grey
 from kinefit.images.photogrammetry.states import measure_states, rigid_motion, surface_strain
@@ -56,13 +58,13 @@ class StateImages:
     videos: tuple[Path, ...]
 
 
-def read_views(calibration: Path, unit: str, views: Sequence[str]) -> tuple[Rig, StateImages]:
+def read_views(calibration: Path, unit: str, views: Sequence[str], fewest: int = 2) -> tuple[Rig, StateImages]:
     """Cameras that are named, and their files; a calibration that states no image size has that of the first view.
 
     Raises
     ------
     ObservationError
-        Fewer than two views, one without a name, photographs beside videos, or other numbers of photographs.
+        Fewer than `fewest` views, one without a name, photographs beside videos, or other numbers of photographs.
     FileError
         A file or folder that is not there or holds no image.
     """
@@ -82,7 +84,7 @@ def read_views(calibration: Path, unit: str, views: Sequence[str]) -> tuple[Rig,
             photographs.append((place,))
         else:
             videos.append(place)
-    if len(names) < 2 or (photographs and videos) or len({len(files) for files in photographs}) > 1:
+    if len(names) < fewest or (photographs and videos) or len({len(files) for files in photographs}) > 1:
         counts = ", ".join(str(len(files)) for files in photographs)
         problem = f"these {len(names)} views do not go together: {len(videos)} videos, photographs: {counts or 'none'}"
         raise ObservationError(problem, remedy="Give at least two views: all videos, or all with as many photographs.")
@@ -172,6 +174,19 @@ class Wanted:
     motion: Path | None = None
     bounds: tuple[float, float] | None = None
     neighbours: bool = False
+    bright: int | None = None
+    reach: int | None = None
+
+    def tracker(self, rig: Rig, rate: float, motion: Motion | None) -> SurfaceTracker:
+        """Tracker of videos: of bright points, or of texture."""
+        least = MIN_CORRELATION if self.least is None else self.least
+        reach = SurfaceTracking.reach if self.reach is None else self.reach
+        settings = SurfaceTracking(window=self.side_of_all(), step=self.step, reach=reach, least=least)
+        mask = mask_of(self.mask, self.field)
+        if self.bright is not None:
+            return BrightPointTracker(rig, rate, settings, mask, diameter=self.bright)
+        seeds = None if self.seeds is None else read_seeds(self.seeds, len(rig))
+        return SurfaceTracker(rig, rate, settings, mask, seeds, motion)
 
     def side_of_all(self) -> int:
         """Side of the windows [px], of all; ObservationError for one that is no odd number."""
@@ -369,12 +384,7 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
         if motion is not None:
             _check_motion(motion, wanted.motion, videos[0].rate)
         count = min(len(video) for video in videos)
-        settings = SurfaceTracking(
-            window=wanted.side_of_all(), step=wanted.step,
-            least=MIN_CORRELATION if wanted.least is None else wanted.least,
-        )  # fmt: skip
-        seeds = None if wanted.seeds is None else read_seeds(wanted.seeds, len(rig))
-        tracker = SurfaceTracker(rig, videos[0].rate, settings, mask_of(wanted.mask, wanted.field), seeds, motion)
+        tracker = wanted.tracker(rig, videos[0].rate, motion)
         lines, middle = list[str](), list[SplineImage]()
         for k in range(count):
             images = [spline_of(video.read(k), wanted.field, wanted.smooth) for video in videos]
@@ -392,7 +402,8 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
     kept, cut = paths, dict[str, int]()
     if len(paths.times) > 2:
         kept, cut = filtered(
-            paths, radius=_surroundings(paths), bounds=wanted.bounds, neighbours=wanted.neighbours
+            paths, radius=_surroundings(paths), bounds=wanted.bounds, neighbours=wanted.neighbours,
+            uniformity=wanted.bright is None,
         )  # fmt: skip
     write_paths_csv(kept, wanted.out / "trajectories.csv")
     if kept.live.any():
@@ -412,6 +423,13 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
     if cut:
         lines.insert(1, "points rejected by filters: " + ", ".join(f"{name} {count}" for name, count in cut.items()))
     return lines
+
+
+def flat_video(path: Path, millimetres: float) -> tuple[Rig, StateImages]:
+    """A camera that faces a flat surface, and its video; raises FileError for one that cannot be read."""
+    with Video(path) as video:
+        camera = flat_camera(video.size, millimetres / 1e3)
+    return Rig((camera,)), StateImages((camera.name,), (), (path,))
 
 
 def _check_motion(motion: Motion, path: Path | None, rate: float) -> None:

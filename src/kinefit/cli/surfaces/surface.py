@@ -15,9 +15,10 @@ Examples:
   kinefit surface calib.toml 201=states/201 202=states/202 --gauge 5  folders: states of one surface; strain over 5 mm
   kinefit surface calib.toml a=a.mp4 b=b.mp4 --window 21              videos: the surface is tracked
   kinefit surface before.png after.png --flat 0.05 --gauge 5          one camera, a flat plate, 0.05 mm per pixel
+  kinefit surface side.mp4 --flat 1.2 --bright 10                     one video; spheres on skin, up to 10 px wide
 """)  # fmt: skip
 @click.argument("calibration", type=_screen.PATH)
-@click.argument("views", nargs=-1, required=True, metavar="CAMERA=PATH...")
+@click.argument("views", nargs=-1, metavar="CAMERA=PATH...")
 @click.option("-o", "--out", type=_screen.PATH, default=Path("surface"), help="Output folder.")
 @click.option("--unit", default="auto", help="Calibration's unit: m, cm, mm, or metres.  [default: as it states]")
 @click.option("--window", default="13", show_default=True, help="Side of the matched windows [px], odd; or 'texture'.")
@@ -44,6 +45,11 @@ Examples:
     "--bounds", type=(float, float), metavar="M/S M/S²",
     help="Videos: largest speed and acceleration of a path; a path ends where it exceeds them.",
 )  # fmt: skip
+@click.option(
+    "--bright", type=click.IntRange(3), metavar="PX",
+    help="Videos: track bright points (retroreflective spheres), at most PX wide, by their centroids.",
+)  # fmt: skip
+@click.option("--reach", type=click.IntRange(1), metavar="PX", help="Videos: half side of search boxes.  [default: 8]")
 @click.option("--neighbours", is_flag=True, help="Videos: also reject points whose neighbours were rejected.")
 @click.option("--field", type=click.Choice(["odd", "even"]), help="Interlaced images: use only these lines.")
 @_screen.verbose_option
@@ -51,7 +57,7 @@ def surface(
     calibration: Path, views: tuple[str, ...], out: Path, unit: str, window: str, step: int, mask: Path | None,
     seeds: Path | None, least: float | None, gauge: float | None, incremental: bool, still: int | None,
     smooth: float, flat: float | None, motion: Path | None, bounds: tuple[float, float] | None,
-    neighbours: bool, field: str | None,
+    bright: int | None, reach: int | None, neighbours: bool, field: str | None,
 ) -> None:  # fmt: skip
     """Measure a surface with two or more cameras: points with standard deviations, mesh, displacement, strain.
 
@@ -59,10 +65,13 @@ def surface(
     photograph, its folder of photographs (states, in the order of their names) or its video. The grid of points lies on
     the first image of the first camera.
 
-    With --flat there is no calibration: all arguments are photographs, before and after.
+    With --flat there is no calibration: all arguments are photographs, before and after, or there is one video. With
+    --motion one camera is enough: its points lie on the body.
     """
     from kinefit.cli.surfaces._measure import (
+        PHOTOGRAPHS,
         Wanted,
+        flat_video,
         measure_one_camera,
         measure_photographs,
         measure_videos,
@@ -72,16 +81,26 @@ def surface(
 
     _screen.check_folder(out)
     wanted = Wanted(
-        out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth, motion, bounds, neighbours
+        out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth, motion, bounds, neighbours,
+        bright, reach,
     )  # fmt: skip
-    videos_alone = {"--motion": motion, "--bounds": bounds, "--neighbours": neighbours or None}
+    videos_alone = {
+        "--motion": motion, "--bounds": bounds, "--bright": bright, "--reach": reach, "--neighbours": neighbours or None
+    }  # fmt: skip
     of_videos = [name for name, value in videos_alone.items() if value is not None]
-    if of_videos and flat is not None:
+    for name, value in (("--motion", motion), ("--seeds", seeds)):
+        if value is not None and bright is not None:
+            raise ObservationError(f"{name} needs texture, --bright has none", remedy="Leave out one of them.")
+    one_video = flat is not None and not views and calibration.suffix.lower() not in PHOTOGRAPHS
+    if one_video and (motion or seeds) is not None:
+        raise ObservationError("--motion and --seeds need a calibration", remedy="Leave them out, or leave out --flat.")
+    if of_videos and flat is not None and not one_video:
         raise ObservationError(f"{of_videos[0]} needs videos; --flat has photographs", remedy="Leave out one of them.")
-    if flat is not None:
+    if flat is not None and not one_video:
         lines = measure_one_camera([calibration, *map(Path, views)], flat, wanted)
     else:
-        rig, paths = read_views(calibration, unit, views)
+        fewest = 1 if motion is not None else 2
+        rig, paths = flat_video(calibration, flat) if one_video else read_views(calibration, unit, views, fewest)
         if of_videos and not paths.videos:
             problem = f"{of_videos[0]} needs videos; the views are photographs"
             raise ObservationError(problem, remedy="Leave it out, or give videos.")

@@ -158,8 +158,8 @@ def _loaded(motion: Motion) -> Iterator[_Loaded]:
 def standing_mass(trials: Sequence[Sequence[ForcePlate]], body: Body) -> float | None:
     """[kg] of a person who stands still with all weight on plates in the first trial that shows it; None without one.
 
-    Plates of each trial. The load is steady to 2 % for half a second or more, and the mass is one that people of the stature have: what else
-    stands on plates, or beside them with one foot, is far from it.
+    Plates of each trial. The load is steady to 2 % for half a second or more, and the mass is one that people of the
+    stature have: what else stands on plates, or beside them with one foot, is far from it.
     """
     return next((mass for plates in trials if plates and (mass := _standing(plates, body))), None)
 

@@ -67,18 +67,19 @@ class MeasuredSurface:
         return self.grid.triangles(self.measured)
 
 
-def check_images(rig: Rig, images: Sequence[SplineImage]) -> None:
-    """Check that images belong to the cameras of a rig.
+def check_images(rig: Rig, images: Sequence[SplineImage], fewest: int = 2) -> None:
+    """Check that images belong to the cameras of a rig, `fewest` or more.
 
     Raises
     ------
     ObservationError
-        There are fewer than two images, or not one for each camera.
+        There are too few images, or not one for each camera.
     CalibrationError
         An image differs in size from its camera's calibration, or a camera stands where the first one does.
     """
-    if len(images) != len(rig) or len(rig) < 2:
-        raise ObservationError(f"{len(images)} images for {len(rig)} cameras", remedy="Give one of each, two or more.")
+    if len(images) != len(rig) or len(rig) < fewest:
+        remedy = f"Give one of each, {fewest} or more."
+        raise ObservationError(f"{len(images)} images for {len(rig)} cameras", remedy=remedy)
     for camera, image in zip(rig, images):
         if camera.size != image.size:
             has, was = ("x".join(map(str, size)) for size in (image.size, camera.size))

@@ -5,6 +5,10 @@ N. D'Apuzzo, R. Plänkers, P. Fua, A. Gruen and D. Thalmann, Modeling human bodi
 then between the views; a point is kept if both agree. Lost points are regenerated, and new ones created as they become
 visible, from their neighbours. If a body's motion is known, lost points are re-identified when it brings them back into
 view (`returning`).
+
+One camera has no match between views as a check. There a point is matched back to the image before, and no other place
+of the search box may look alike. Then it is matched from its first image, so that errors do not add up. Its place in
+space is on the plane z = 0, or on the body whose motion is given (`one_camera`).
 """
 
 from __future__ import annotations
@@ -18,9 +22,10 @@ from numpy.typing import NDArray
 from kinefit.bodies.motion import Motion
 from kinefit.errors import ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
-from kinefit.images.photogrammetry.intersection import intersect
-from kinefit.images.photogrammetry.least_squares_matching import WINDOW, match
-from kinefit.images.photogrammetry.matching.multi_image import search_box
+from kinefit.images.photogrammetry.intersection import Intersections, intersect
+from kinefit.images.photogrammetry.least_squares_matching import WINDOW, Matches, match
+from kinefit.images.photogrammetry.matching.multi_image import Correlations, search_box
+from kinefit.images.photogrammetry.one_camera import BODY_SIGMA, Ranges, at_range, body_ranges, plane_ranges
 from kinefit.images.photogrammetry.region_growing import MIN_CORRELATION, Grid, Seeds
 from kinefit.images.photogrammetry.returning import PointReturn, Vanished
 from kinefit.images.photogrammetry.spline_image import SplineImage
@@ -31,6 +36,10 @@ _MAX_DISAGREEMENT_SIGMAS = 3.0  # by which temporal and spatial matches may diff
 _MAX_STEPS_APART = 3.0  # of the grid from a lost point to the tracked one whose motion it tries
 _MAX_RETURN_SHARE = 0.5  # of `reach`: distance of a re-identified point from its prediction
 _MAX_SEARCH_ROUNDS = 20  # in which a motion spreads from point to point
+_EXACT_VARIANCE = 1e-6  # [px²] of the points in the first image, which are exact by definition
+_MAX_BACKWARD_PX = 0.2  # of one camera: distance of a point that is matched back from where it came
+_MAX_ANCHOR_GAP_PX = 2.0  # of one camera: distance of a point from where its window of the first image matches
+_MAX_RUNNER_UP_RATIO = 0.95  # of one camera: second-best correlation in a search box to the best
 
 
 @dataclass(frozen=True)
@@ -88,13 +97,14 @@ class SurfaceTracker:
 
     Parameters
     ----------
-    rig : two or more cameras; points are chosen in the first one's image
+    rig : cameras; points are chosen in the first one's image. Of a single camera no new points are made
     rate : [Hz]
     settings : SurfaceTracking
     mask : (H, W) bool, region of the surface in the first camera's first image. Later points need tracked neighbours
         and so stay on the surface. Default: the whole image
     seeds : for the first frame, as in `measure`
-    motion : of the body that has this surface, frame by frame; it predicts where lost points return. Default: none
+    motion : of the body that has this surface, frame by frame; it predicts where lost points return. With a single
+        camera it also places the points in space, to 2 cm along the ray. Default: none
     """
 
     rig: Rig
@@ -108,8 +118,14 @@ class SurfaceTracker:
     _velocity: NDArray = field(default_factory=lambda: np.zeros((0, 0, 2)))
     _next: int = 0
     _vanished: Vanished | None = None
+    _ranges: Ranges | None = None
+    _first: Sequence[SplineImage] = ()
+    _maps: NDArray = field(default_factory=lambda: np.zeros((0, 2, 2)))
 
     def __post_init__(self) -> None:
+        if len(self.rig) == 1:
+            camera = self.rig.cameras[0]
+            self._ranges = plane_ranges(camera) if self.motion is None else body_ranges(self.motion, camera)
         if self.motion is not None:
             self._vanished = Vanished(self.rig, self.motion, self.settings.window)
 
@@ -123,7 +139,7 @@ class SurfaceTracker:
         TrackingError
             No point is left.
         """
-        check_images(self.rig, images)
+        check_images(self.rig, images, fewest=1)
         if not self._frames:
             points, velocity = self._measure_first(images), None
         else:
@@ -134,7 +150,7 @@ class SurfaceTracker:
         self._velocity = np.zeros_like(points.uv) if velocity is None else velocity
         if velocity is not None and self._vanished is not None:
             points = self._append(points, self._reidentify(images, points))
-        if velocity is not None and self.settings.regenerate:
+        if velocity is not None and self.settings.regenerate and self._ranges is None:
             points = self._append(points, self._regenerate(images, points))
         self._images = images
         self._frames.append(points)
@@ -171,12 +187,32 @@ class SurfaceTracker:
     def _measure_first(self, images: Sequence[SplineImage]) -> SurfacePoints:
         settings = self.settings
         grid = Grid.of(images[0].size, settings.step, margin=settings.window // 2 + 2, mask=self.mask)
+        if self._ranges is not None:
+            self._first = images
+            return self._placed(grid.points[grid.inside])
         surface = measure(
             self.rig, images, grid, seeds=self.seeds, window=settings.window, least=settings.least, constrained=False
         )
         index = np.flatnonzero(surface.measured)
         kept = (surface.x_world, surface.covariance, surface.uv, surface.deformation)
         return SurfacePoints(self._new_ids(len(index)), *(value[index] for value in kept))
+
+    def _placed(self, uv: NDArray) -> SurfacePoints:
+        """New points of a single camera at image points (N, 2) [px]."""
+        covariance = np.tile(_EXACT_VARIANCE * np.eye(2), (len(uv), 1, 1, 1))
+        found = self._locate(uv[:, None], covariance)
+        index = np.flatnonzero(np.isfinite(found.parallax))
+        maps, ids = np.zeros((len(index), 0, 2, 2)), self._new_ids(len(index))
+        self._maps = np.tile(np.eye(2), (len(index), 1, 1))
+        return SurfacePoints(ids, found.x_world[index], found.covariance[index], uv[index, None], maps)
+
+    def _locate(self, uv: NDArray, covariance: NDArray) -> Intersections:
+        """Places in space of image points (N, C, 2) [px] of the next frame, with covariances (N, C, 2, 2) [px²]."""
+        if self._ranges is None:
+            return intersect(self.rig, uv, covariance)
+        sigma = 0.0 if self.motion is None else BODY_SIGMA
+        ranges = self._ranges(len(self._frames), uv[:, 0])
+        return at_range(self.rig.cameras[0], uv[:, 0], covariance[:, 0], ranges, sigma)
 
     def _new_ids(self, count: int) -> NDArray[np.int64]:
         """(count,) ids of new points."""
@@ -206,8 +242,10 @@ class SurfaceTracker:
             matches = self._match_temporally(images, last.only(lost), shift)
             for values, found in zip((uv, own, velocity, maps, good), matches):
                 values[lost] = found
+        if self._ranges is not None:
+            good[good] = self._anchor(images[0], last.ids[good], uv, own, good)
         points, uv, own, velocity, maps = last.only(good), uv[good], own[good], velocity[good], maps[good]
-        meet = intersect(self.rig, uv, own)
+        meet = self._locate(uv, own)
         agree = meet.parallax <= max_parallax(meet.parallax)
         return SurfacePoints(points.ids, meet.x_world, meet.covariance, uv, maps).only(agree), velocity[agree]
 
@@ -222,7 +260,7 @@ class SurfaceTracker:
         covariance : (M, C, 2, 2) [px²]
         velocity : (M, C, 2) [px] by temporal matching alone
         deformation : (M, C - 1, 2, 2)
-        good : (M,) bool, found in every view, and spatial matching agrees
+        good : (M,) bool, found in every view, and spatial matching agrees; of one camera, matching back
         """
         settings = self.settings
         uv, covariance = np.empty_like(last.uv), np.empty((*last.uv.shape, 2))
@@ -234,10 +272,37 @@ class SurfaceTracker:
             found = match(old, new, last.uv[:, c], start, window=settings.window)
             uv[:, c], covariance[:, c] = found.uv, found.covariance
             good &= found.found & (found.correlation >= settings.least)
+            good &= self._is_confirmed(old, new, box, found)
         velocity, maps, index = uv - last.uv, last.deformation.copy(), np.flatnonzero(good)
         for c in range(1, len(images)):
             good[index] &= self._match_spatially(images, c, index, uv, covariance, maps)
         return uv, covariance, velocity, maps, good
+
+    def _anchor(
+        self, image: SplineImage, ids: NDArray, uv: NDArray, covariance: NDArray, good: NDArray
+    ) -> NDArray[np.bool_]:
+        """(K,) which points `ids` (K,) of a single camera still look as in its first image.
+
+        Replaces the image points (M, C, 2) [px] of `good` (M,) by those of their windows in the first image, so that
+        errors of the steps do not add up; points that are further off than `agreement` stay as they are.
+        """
+        settings, begin, at = self.settings, self._frames[0].uv[ids, 0], np.flatnonzero(good)
+        found = match(self._first[0], image, begin, uv[at, 0], deformation=self._maps[ids], window=settings.window)
+        gap = np.linalg.norm(found.uv - uv[at, 0], axis=1)
+        alike = found.found & (found.correlation >= settings.least) & (gap <= _MAX_ANCHOR_GAP_PX)
+        near = alike & (gap <= settings.agreement)
+        uv[at[near], 0], covariance[at[near], 0] = found.uv[near], found.covariance[near]
+        self._maps[ids[near]] = found.deformation[near]
+        return np.asarray(alike)
+
+    def _is_confirmed(self, old: SplineImage, new: SplineImage, box: Correlations, found: Matches) -> NDArray[np.bool_]:
+        """(N,) which matches of a single camera are unique in their box and lead back to where they came from."""
+        if self._ranges is None:
+            return np.ones(len(found.uv), bool)
+        inverse = np.linalg.pinv(np.nan_to_num(found.deformation))
+        back = match(new, old, found.uv, found.points, deformation=inverse, window=self.settings.window)
+        unique = ~(box.runner_up > _MAX_RUNNER_UP_RATIO * box.best)
+        return np.asarray(unique & (np.linalg.norm(back.uv - found.points, axis=1) <= _MAX_BACKWARD_PX))
 
     def _reidentify(self, images: Sequence[SplineImage], points: SurfacePoints) -> SurfacePoints:
         """Re-identify lost points that the body's motion brings back into view.
@@ -259,13 +324,14 @@ class SurfaceTracker:
             start = np.where(np.isfinite(box.uv), box.uv, expected.uv[:, c])
             found = match(mosaic, image, at, start, deformation=expected.maps[:, c], window=window)
             good &= found.found & (found.correlation >= settings.least)
+            good &= self._is_confirmed(mosaic, image, box, found)
             good &= np.linalg.norm(found.uv - expected.uv[:, c], axis=1) <= _MAX_RETURN_SHARE * settings.reach
             uv[:, c], covariance[:, c] = found.uv, found.covariance
         maps, index = expected.between.copy(), np.flatnonzero(good)
         for c in range(1, len(images)):
             good[index] &= self._match_spatially(images, c, index, uv, covariance, maps)
         index = np.flatnonzero(good)
-        intersections = intersect(self.rig, uv[index], covariance[index])
+        intersections = self._locate(uv[index], covariance[index])
         consistent = intersections.parallax <= max_parallax(intersections.parallax)
         self._vanished.mark_found(frame, expected.index[index[consistent]])
         kept = (expected.ids[index], intersections.x_world, intersections.covariance, uv[index], maps[index])

@@ -157,8 +157,9 @@ def has_neighbours(paths: Trajectories, *, radius: float) -> NDArray[np.bool_]:
 
 
 def filtered(
-    paths: Trajectories, *, radius: float, bounds: tuple[float, float] | None = None, neighbours: bool = False
-) -> tuple[Trajectories, dict[str, int]]:
+    paths: Trajectories, *, radius: float, bounds: tuple[float, float] | None = None, neighbours: bool = False,
+    uniformity: bool = True,
+) -> tuple[Trajectories, dict[str, int]]:  # fmt: skip
     """Filter paths; returns them and the number of points that each filter removed.
 
     Parameters
@@ -167,6 +168,7 @@ def filtered(
     bounds : of speed [m/s] and acceleration [m/s²]; None: without the first filter
     neighbours : whether to repeat the second filter with the limit of the first round until it removes none, and then
         remove points without neighbours; limbs with few points are lost
+    uniformity : whether to apply the second filter at all
 
     Raises
     ------
@@ -185,7 +187,7 @@ def filtered(
     if bounds is not None:
         cut("bounds", within_bounds(kept, speed=bounds[0], acceleration=bounds[1]))
     limit = None
-    for _ in range(_MAX_ROUNDS if neighbours else 1):
+    for _ in range(_MAX_ROUNDS if neighbours else int(uniformity)):
         off = _velocity_deviations(kept, radius, 1)
         limit = _outlier_limit(off) if limit is None else limit
         if not cut("uniformity", kept.live & ~(off > limit)):
