@@ -340,8 +340,8 @@ def test_a_bright_sphere_is_followed_by_its_centroid(tmp_path):
 
 
 def test_one_camera_follows_points_on_a_body_whose_motion_is_given(tmp_path):
-    from benchmarks.surface_body import cameras, moving_arm
-    from benchmarks.textured import textured_picture
+    from benchmarks.accuracy.surfaces.surface_body import cameras, moving_arm
+    from benchmarks.scenes.textured import textured_picture
 
     from kinefit.bodies.surfaces.places import body_mesh, nearest
     from kinefit.exporters.motion_file import write_motion

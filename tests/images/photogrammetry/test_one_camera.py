@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.surface_body import moving_arm
+from benchmarks.accuracy.surfaces.surface_body import moving_arm
 from tests.images.photogrammetry import scenes
 
 from kinefit.bodies.surfaces.places import nearest

@@ -100,7 +100,7 @@ def surface(
         lines = measure_one_camera([calibration, *map(Path, views)], flat, wanted)
     else:
         fewest = 1 if motion is not None else 2
-        rig, paths = flat_video(calibration, flat) if one_video else read_views(calibration, unit, views, fewest)
+        rig, paths = flat_video(calibration, flat or 0.0) if one_video else read_views(calibration, unit, views, fewest)
         if of_videos and not paths.videos:
             problem = f"{of_videos[0]} needs videos; the views are photographs"
             raise ObservationError(problem, remedy="Leave it out, or give videos.")
