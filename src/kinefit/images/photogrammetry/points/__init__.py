@@ -1,0 +1,1 @@
+"""Bright points, and points of one camera."""
