@@ -173,7 +173,7 @@ def test_a_part_is_logged_with_its_command(log, monkeypatch, options):
     part = SimpleNamespace(run=lambda: figure("a", 1.0, "ms", "<= 2"))
     monkeypatch.setattr(figures, "module_of", {"gait_events": part}.get)
     monkeypatch.setenv("PYTHONPATH", "")
-    figures.run_parts("gait", options)
+    figures.run_parts("gait", ["gait_events", *options])
     assert {r.command for r in read(log).values()} == set() if options else {"python -m benchmarks gait gait_events"}
 
 
