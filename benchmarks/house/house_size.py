@@ -8,6 +8,7 @@ import re
 import tokenize
 from collections import Counter
 from functools import cache
+from pathlib import Path
 
 from benchmarks.figures import ROOT, figure
 from benchmarks.house.house_imports import PACKAGE, circles
@@ -77,6 +78,17 @@ def many_parameters(tree: ast.AST) -> list[str]:
     return out
 
 
+def entries(room: Path) -> list[str]:
+    """Files and folders of a folder, without its `__init__.py`."""
+    return [entry.name for entry in room.iterdir() if not entry.name.startswith("__")]
+
+
+def imported_lines(tree: ast.AST) -> int:
+    """Lines of import statements."""
+    nodes = (node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom))
+    return sum((node.end_lineno or node.lineno) - node.lineno + 1 for node in nodes)
+
+
 @cache
 def house_size() -> Counter[str]:
     """Size of the whole package."""
@@ -106,8 +118,17 @@ def run() -> None:
     figure("house_type_questions", sum(len(type_questions(tree)) for tree in trees.values()), "lines", "<= 5")
     outside = [tree for path, tree in trees.items() if not path.name.startswith("_kernels")]
     figure("house_many_parameters", sum(map(len, map(many_parameters, outside))), "functions outside kernels", "<= 20")
-    rooms = Counter(path.parent for path in texts if path.name != "__init__.py" and path.parent != PACKAGE)
-    room, files = rooms.most_common(1)[0]
-    figure("house_largest_room", files, f"files in {room.relative_to(PACKAGE).as_posix()}", "<= 15")
+    rooms = [path.parent for path in texts if path.name == "__init__.py" and path.parent.parent == PACKAGE]
+    figure("house_rooms", len(rooms), "", "<= 16")
+    sizes = {path.parent: len(entries(path.parent)) for path in texts if path.parent != PACKAGE}
+    room = max(sizes, key=lambda room: sizes[room])
+    figure("house_largest_room", sizes[room], f"entries in {room.relative_to(PACKAGE).as_posix()}", "<= 15")
+    imports = sum(imported_lines(tree) for tree in trees.values())
+    figure("house_imports", 100.0 * imports / size["code_lines"], "% of code lines", "<= 8")
+    own = [path.read_text("utf-8") for path in sorted((ROOT / "benchmarks").rglob("*.py"))]
+    figure("house_benchmarks", sum(source_size(text)["code_lines"] for text in own), "code lines", "<= 12000")
+    pages = [path.read_text("utf-8") for path in sorted((ROOT / "docs").rglob("*.md")) if "generated" not in path.parts]
+    figure("house_pages", len(pages) - 1, "pages beside the index", "<= 40")
+    figure("house_page_words", sum(len(text.split()) for text in pages), "words", "<= 70000")
     classes = Counter(n.name for tree in trees.values() for n in ast.walk(tree) if isinstance(n, ast.ClassDef))
     figure("house_class_names_twice", sum(count > 1 for count in classes.values()), "", "== 0")
