@@ -318,7 +318,7 @@ def fit_file(
             notes += [*findings, *(f for f in found_labels if f.severity == "note")]
         files: dict[str, Path] = {}
         own = folder / person if len(people) > 1 else folder
-        worn = worn_body(subject, markers.names)
+        worn = replace(worn_body(subject, markers.names), mass=motion.body.mass)
         plain = [name for name in formats if name not in ("markers", "osim", "report", "trc")]
         write_results(motion, own, plain, step, files)
         if "trc" in formats:

@@ -10,6 +10,8 @@ import numpy as np
 
 from kinefit._arguments import checked
 from kinefit._files import write_text
+from kinefit.bodies.masses import segment_masses
+from kinefit.exporters.gait.forces import force_plots
 from kinefit.exporters.gait.record import SIDES, GaitRecord, straight_cycles
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.angles import cycle_plots
@@ -19,6 +21,8 @@ from kinefit.exporters.report.strides import Quantity
 from kinefit.findings import listed
 
 _OPEN_JOINTS = ("Pelvis", "Hip", "Knee", "Ankle")  # joints whose curves stand open
+
+_FORCES = "Of feet that stand alone on force plates, from contact to toe-off, each step a line."
 
 _DEFINITIONS = (
     "A stride lasts from one contact of a foot to its next. Stance lasts from contact to toe-off. It and double "
@@ -59,9 +63,15 @@ def write_gait_page(
         facts["Stature"] = f"{motion.body.stature:.2f} m"
     walked = listed([walk.name for walk in record.walks], 8)
     subject = f" of {session['subject']}" if session.get("subject") else ""
+    masses = segment_masses(motion.body)
+    if np.isfinite(masses.std):
+        doubt = f" ± {2.0 * masses.std:.0f}, by the stature" if masses.std else ""
+        facts["Mass"] = f"{masses.masses.sum():.1f}{doubt} kg"
+    forces = force_plots(walk.motion for walk in record.walks)
     sections = [
         p.section("Gait", p.facts(facts), *(p.callout("note", note) for note in record.notes), *_numbers(record)),
         p.section("Curves over the cycle", *_curves(record, norms)),
+        *([p.section("Ground forces", p.paragraph(_FORCES), *forces)] if forces else []),
         p.section("How it is measured", p.bullets(_DEFINITIONS)),
     ]
     write_text(path, p.page(f"Gait record{subject}", sections, subtitle=f"{date}. {walked}."))
@@ -80,7 +90,7 @@ def _numbers(record: GaitRecord) -> list[p.Html]:
     steps = sum(record.count("step", side, record.walk) for side in SIDES)
     turned = sum(one.walk != record.walk for one in record.stretches)
     how = "straight" if record.walk == "straight" else "in a turn"
-    text = f"Strides: {counts}, and {steps} single steps, walking {how}."
+    text = f"Strides: {counts}, and {steps} single step{'' if steps == 1 else 's'}, walking {how}."
     more = f" {turned} strides and steps in turns are in the tables alone." if turned else ""
     return [p.paragraph(text + more), p.table(columns, rows)]
 

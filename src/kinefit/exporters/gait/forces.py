@@ -1,0 +1,77 @@
+"""Ground forces of steps on plates, over stance, in body weights."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.masses import segment_masses
+from kinefit.bodies.motion import UP_AXES, Motion
+from kinefit.exporters.gait.plates import GRAVITY, footfalls
+from kinefit.exporters.report import page as p
+
+PERCENT = np.linspace(0.0, 100.0, 101)
+"""Of stance, from contact to toe-off, at which forces are given."""
+
+_COLOURS = {"left": p.LEFT_COLOUR, "right": p.RIGHT_COLOUR}
+
+
+@dataclass(frozen=True, eq=False)
+class StepForces:
+    """The ground's force on a foot that stands alone on plates, from contact to toe-off.
+
+    Parameters
+    ----------
+    side : "left" or "right"
+    vertical, forward : (101,) [body weights] at `PERCENT`; forward is where the pelvis faces in the middle of stance
+    """
+
+    side: str
+    vertical: NDArray
+    forward: NDArray
+
+
+def step_forces(motion: Motion) -> list[StepForces]:
+    """Forces of all whole steps on the plates of a motion, in the order of their contacts."""
+    weight = GRAVITY * float(segment_masses(motion.body).masses.sum())
+    up, plates, out = np.array(UP_AXES[motion.up]), {plate.name: plate for plate in motion.plates}, list[StepForces]()
+    for step in footfalls(motion):
+        if not np.isfinite([step.contact, step.off]).all():
+            continue
+        times = step.contact + (step.off - step.contact) * PERCENT / 100.0
+        force = np.zeros((len(times), 3))
+        for name in step.plate.split(", "):
+            plate = plates[name]
+            force += np.column_stack([np.interp(times, plate.times, column, 0.0, 0.0) for column in plate.force.T])
+        across = _across(motion, float(times[len(times) // 2]))
+        ahead = np.cross(up, across)
+        ahead /= np.linalg.norm(ahead)
+        out.append(StepForces(step.side, force @ up / weight, force @ ahead / weight))
+    return out
+
+
+def _across(motion: Motion, time: float) -> NDArray:
+    """(3,) [m] from the left hip to the right one in the world."""
+    frame = int(np.argmin(np.abs(motion.times - time)))
+    hips = motion.body.landmarks.select(("l_hip", "r_hip"))
+    left, right = motion.part(slice(frame, frame + 1)).positions(hips)[0]
+    return np.asarray(right - left)
+
+
+def force_plots(motions: Iterable[Motion]) -> list[p.Html]:
+    """A plot of the vertical and one of the forward force over stance, every step a line; none without such steps."""
+    steps = [step for motion in motions if motion.plates for step in step_forces(motion)]
+    out = []
+    for what, text in (("vertical", "Vertical force"), ("forward", "Force forward (braking is negative)")):
+        lines, sides = [], set[str]()
+        for step in steps:
+            lines.append(p.line(
+                PERCENT, getattr(step, what), step.side, _COLOURS[step.side], 1.5, legend=step.side not in sides
+            ))  # fmt: skip
+            sides.add(step.side)
+        axes = {"xaxis": {"title": {"text": "stance [%]"}}, "yaxis": {"title": {"text": "body weights"}}}
+        out += [p.paragraph(f"{text}."), p.plot(lines, axes, label=text)] if lines else []
+    return out
