@@ -51,7 +51,7 @@ def replayed(
     carried[:, :3, 3] = (speed * t + 0.5 * gain * t**2)[:, None] * down
     return replace(
         motion, Ts_world_root=carried @ T @ motion.Ts_world_root, joint_std=_turned(motion.joint_std, T[:3, :3]),
-        residuals={}, name=f"{motion.name} replayed",
+        residuals={}, plates=(), name=f"{motion.name} replayed",
         provenance={**motion.provenance, "replay": {"slope": slope, "heading": heading, "speed": speed, "gain": gain}},
     )  # fmt: skip
 
