@@ -42,8 +42,8 @@ _COUNT_KEYS = "window.typed = 0; window.addEventListener('keydown', () => { wind
 
 def run() -> None:
     """Print every figure."""
-    lines = sum(code_lines(path.read_text("utf-8")) for path in (PACKAGE / "app").rglob("*.py"))
-    texts = sum(len(path.read_text("utf-8").splitlines()) for path in (PACKAGE / "app").glob("*.toml"))
+    lines = sum(code_lines(path.read_text("utf-8")) for path in (PACKAGE / "studio" / "app").rglob("*.py"))
+    texts = sum(len(path.read_text("utf-8").splitlines()) for path in (PACKAGE / "studio" / "app").glob("*.toml"))
     print(f"# {lines} lines of code, {texts} of texts in two languages")
     figure("window_lines", lines + texts, "lines", "<= 2500")
     four, walk = data("video_balancing_4cam"), data("video_mono_opencap")
