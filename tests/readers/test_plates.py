@@ -12,7 +12,7 @@ from kinefit.readers.plates import read_force_file
 REAL = {
     "gait_biomechzoo/HC002D/straight.c3d": (2, 393.7), "markers_bmc_run/Gait.c3d": (2, 871.4),
     "markers_pycgm/Test_Files/Movement_trial.c3d": (4, 1214.2),
-    "markers/btkdata/Input__C3DSamples__c3d.org__sample01__Eb015pr.c3d": (2, 838.5),
+    "markers/btkdata/Input__C3DSamples__c3d.org__sample01__Eb015pr.c3d": (2, 817.3),
 }  # fmt: skip
 """{file: its plates, and the largest load [N]}; the second is of type 4."""
 CORNERS = np.array([[0.6, 0.4, 0.0], [0.1, 0.4, 0.0], [0.1, 0.0, 0.0], [0.6, 0.0, 0.0]])
@@ -69,7 +69,7 @@ def test_real_plates_are_those_of_ezc3d(data_dir, name):
     assert max(plate.load.max() for plate in plates) == pytest.approx(REAL[name][1], abs=0.1)
     for plate, other in zip(plates, others):
         stood = plate.load > 100.0
-        if "bmc_run" not in name and stood.any():  # whose ZERO names frames of a baseline, which ezc3d leaves
+        if not name.startswith(("markers_bmc", "markers/btk")) and stood.any():  # whose ZERO ezc3d does not use
             np.testing.assert_allclose(np.abs(plate.force[stood]), np.abs(other["force"].T[stood]), atol=1e-3)
             at = 1e-3 * other["center_of_pressure"].T
             np.testing.assert_allclose(plate.centre_of_pressure()[stood], at[stood], atol=1e-5)
@@ -99,6 +99,29 @@ def test_type_1_states_the_centre_of_pressure(tmp_path):
     at = plate.centre_of_pressure()[-1] - plate.centre
     np.testing.assert_allclose(plate.axes @ at, [0.05, -0.03], atol=1e-6)
     np.testing.assert_allclose(plate.free_moment()[-5:], 1e-3 * channels[-5:, 5], atol=1e-6)
+
+
+def test_an_offset_turns_nothing_upside_down(tmp_path):
+    channels = loads(6)
+    channels[:, 2] -= 30.0
+    (plate,) = read_markers(recording(tmp_path, 2, np.concatenate([channels[:40]] * 2 + [channels[80:]]))).plates
+    assert plate.normal @ [0.0, 0.0, 1.0] > 0.99 and plate.load.max() > 600.0
+
+
+def test_frames_of_a_baseline_count_where_nobody_stands(tmp_path):
+    channels = loads(6)
+    channels[:, :3] += [3.0, -2.0, 25.0]
+    zero = lambda first, last: lambda g: g["FORCE_PLATFORM"].update(ZERO=np.array([first, last], np.uint16))
+    at_rest = read_markers(recording(tmp_path, 2, channels, change=zero(1, LOADED)))
+    assert np.abs(at_rest.plates[0].force[: LOADED * SAMPLES]).max() < 1e-3 and not at_rest.notes
+    under_load = read_markers(recording(tmp_path, 2, channels, change=zero(LOADED + 2, LOADED + 8)))
+    assert under_load.plates[0].load[0] == pytest.approx(25.0) and "under load" in under_load.notes[0]
+
+
+def test_a_downward_axis_turns_no_force(tmp_path):
+    down = lambda g: g["POINT"].update(Y_SCREEN=["-Z"])
+    (plate,) = read_markers(recording(tmp_path, 2, loads(6), change=down)).plates
+    assert plate.force[-1, 2] < -600.0 and plate.normal @ [0.0, 0.0, -1.0] > 0.99
 
 
 def test_a_wrong_unit_of_moments_is_named_and_corrected(tmp_path):
@@ -144,11 +167,28 @@ def test_ground_forces_of_opensim(tmp_path):
     np.testing.assert_allclose(plate.centre_of_pressure()[1:], [[0.30, 0.0, 0.20], [0.35, 0.0, 0.22]], atol=1e-9)
 
 
+def test_forces_on_the_plate_are_turned_round(tmp_path):
+    file = tmp_path / "grf.mot"
+    file.write_text(MOT.replace("\t700\t", "\t-700\t").replace("\t710\t", "\t-710\t"))
+    found = read_force_file(file)
+    assert "turned round" in found.notes[0] and found.plates[0].load.max() == pytest.approx(710.0)
+
+
+def test_rounded_times_keep_their_rate(tmp_path):
+    rows = "".join(f"{k / 120:.3f}\t0\t700\t0\t0.3\t0\t0.2\n" for k in range(600))
+    file = tmp_path / "grf.mot"
+    file.write_text(MOT[: MOT.index("0.00\t")] + rows)
+    assert read_force_file(file).plates[0].rate == pytest.approx(120.0, abs=0.01)
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
         ("time\tx\n0\t1\n", "endheader"), (MOT.replace("_px", "_qx"), "ground_force_px"),
         (MOT.replace("710", "much"), "no number"), (MOT.replace("_vx", "_ux"), "ground_force_vx"),
+        (MOT.replace("0.02\t", "0.05\t"), "not evenly spaced"), (MOT.replace("700", "nan"), "force that is no number"),
+        (MOT.replace("0.35", "350"), "350 m from the origin"), (MOT.replace("version=1", "nRows=7"), "3 of 7 rows"),
+        (MOT.replace("\t0.22", ""), "6 cells for 7 columns"),
     ],
 )
 def test_wrong_ground_forces_are_named(tmp_path, text, problem):

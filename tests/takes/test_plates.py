@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit import fit_marker_subject, fit_markers, load_body, load_observations, read_markers, read_take
-from kinefit.errors import FileError
+from kinefit.errors import FileError, KinefitError
 from kinefit.exporters import write_forces, write_markers
 from kinefit.readers.guess.folder import guess_take
 
@@ -65,10 +65,36 @@ def test_plates_of_a_c3d_come_with_its_markers(data_dir, tmp_path):
     assert [p.name for p in plates] == ["plate 1", "plate 2"]
     assert plates[0].first_time == pytest.approx(known[0].first_time + 0.5)
     file.write_text(f'{file.read_text()}sides = "mirrored-x"\n')
-    assert not load_observations(read_take(file)).plates
+    mirrored = load_observations(read_take(file))
+    assert not mirrored.plates and any("mirrored, too" in note for note in mirrored.notes)
 
 
 def test_a_file_without_plates_is_named(folder):
     with pytest.raises(FileError, match="no force plates"):
         write_markers(read_markers(folder / "walk.trc"), folder / "bare.c3d")
         load_observations(take(folder, '[[plate]]\nfile = "bare.c3d"\n'))
+
+
+def test_what_is_named_twice_counts_once(folder):
+    twice = '[[plate]]\nfile = "walk_grf.mot"\n' * 2
+    seen = load_observations(take(folder, twice))
+    assert len(seen.plates) == 2 and any("named twice" in note for note in seen.notes)
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [("turn = [90.0, 0.0, 0.0]\n", "bears its load along z"), ("time_offset = 500.0\n", "its frames are from")],
+)
+def test_plates_of_another_world_or_time_are_refused(folder, line, problem):
+    with pytest.raises(KinefitError, match=problem):
+        load_observations(take(folder, f'[[plate]]\nfile = "walk_grf.mot"\n{line}'))
+
+
+def test_forces_of_another_trial_are_a_comment(folder, tmp_path):
+    for name in ("a.trc", "b.trc"):
+        (tmp_path / name).write_bytes((folder / "walk.trc").read_bytes())
+    (tmp_path / "b_grf.mot").write_bytes((folder / "walk_grf.mot").read_bytes())
+    text = guess_take(tmp_path).text
+    assert '# [[plate]]\n# file = "b_grf.mot"' in text and "\n[[plate]]" not in text
+    (tmp_path / "b_grf.mot").rename(tmp_path / "session.mot")
+    assert '\n[[plate]]\nfile = "session.mot"' in guess_take(tmp_path).text  # the only forces there

@@ -244,8 +244,8 @@ def write_mot(motion: Motion, path: str | PathLike[str]) -> None:
 def write_forces(motion: Motion, path: str | PathLike[str]) -> None:
     """Write what force plates measured as ground forces of OpenSim, y up: `ground_force_1_vx` and so on.
 
-    Force [N], centre of pressure [m] and free moment [N m] of each plate, zero where nobody stands on it, at the rate
-    of the first plate.
+    Force [N], centre of pressure [m] and free moment [N m] of each plate, zero where nobody stands on it, at the
+    highest rate of the plates.
 
     Raises
     ------
@@ -256,14 +256,16 @@ def write_forces(motion: Motion, path: str | PathLike[str]) -> None:
         remedy = "Name the C3D of the trial in [[markers]], or its forces in [[plate]]."
         raise ExportError("this motion has no force plates", file=path, remedy=remedy)
     upright = replace(next(motion.parts(1)), plates=motion.plates).turned("y").plates
-    times = upright[0].times
+    rate, first = max(plate.rate for plate in upright), min(plate.first_time for plate in upright)
+    last = max(float(plate.times[-1]) for plate in upright)
+    times = first + np.arange(round((last - first) * rate) + 1) / rate
     names, columns = ["time"], [times]
-    for k, plate in enumerate(upright, 1):
+    for k, plate in enumerate((plate.at(times) for plate in upright), 1):
         names += [f"ground_force_{k}_{kind}{axis}" for kind in "vp" for axis in "xyz"]
         names += [f"ground_torque_{k}_{axis}" for axis in "xyz"]
         at, turning = plate.centre_of_pressure(), plate.free_moment()[:, None] * plate.normal
         table = np.concatenate([np.where(np.isfinite(at), plate.force, 0.0), at, turning], axis=1)
-        columns += [np.interp(times, plate.times, c, 0.0, 0.0) for c in np.nan_to_num(table).T]
+        columns += list(np.nan_to_num(table).T)
     head = [motion.name.replace("\n", " "), "version=1", f"nRows={len(times)}", f"nColumns={len(names)}"]
     head += ["inDegrees=yes", "endheader", "\t".join(names)]
     row = "\t".join(["%.9f"] + ["%.6f"] * (len(names) - 1))

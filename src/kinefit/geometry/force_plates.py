@@ -46,9 +46,10 @@ class ForcePlate:
 
     @property
     def normal(self) -> NDArray:
-        """(3,) unit vector from the plate to who stands on it."""
+        """(3,) unit vector from the plate to who stands on it: nobody pulls it, so large loads count most."""
         axis = np.cross(*self.axes)
-        return axis if np.sum(self.force @ axis) >= 0 else -axis
+        load = self.force @ axis
+        return axis if np.sum(load * np.abs(load)) >= 0 else -axis
 
     @property
     def axes(self) -> NDArray:
@@ -82,6 +83,15 @@ class ForcePlate:
         return replace(
             self, corners=se3.apply(T_new_world, self.corners), force=self.force @ R.T, moment=self.moment @ R.T
         )
+
+    def at(self, times: NDArray) -> ForcePlate:
+        """The same plate at evenly spaced times (N,) [s], between its samples; without load before and after them."""
+        force, moment = (
+            np.column_stack([np.interp(times, self.times, column, 0.0, 0.0) for column in values.T])
+            for values in (self.force, self.moment)
+        )
+        rate = (len(times) - 1) / float(times[-1] - times[0]) if len(times) > 1 else self.rate
+        return replace(self, rate=rate, first_time=float(times[0]), force=force, moment=moment)
 
     def shifted(self, seconds: float) -> ForcePlate:
         """The same plate by a clock that is so much ahead [s]."""

@@ -8,6 +8,7 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.marker_sets import read_sides
 from kinefit.errors import ObservationError
 from kinefit.geometry.force_plates import ForcePlate
 from kinefit.observations.arrays import check_seen, freeze, frozen, sealed
@@ -298,6 +299,14 @@ class Markers:
         """First frame that shows a marker, and one after the last; all frames where none does."""
         seen = np.flatnonzero(np.isfinite(self.positions[..., 0]).any(axis=1))
         return (int(seen[0]), int(seen[-1]) + 1) if len(seen) else (0, len(self))
+
+    def sided(self, sides: str) -> Markers:
+        """With left and right as `sides` states, see `read_sides`; a mirrored world loses its plates, with a note."""
+        names, positions = read_sides(self.names, self.positions, sides)
+        if not (self.plates and sides.startswith("mirrored")):
+            return replace(self, names=names, positions=positions)
+        text = "force plates are left out: nothing says whether they are mirrored, too"
+        return replace(self, names=names, positions=positions, plates=(), notes=(*self.notes, text))
 
     def trimmed(self) -> Markers:
         """The recording without empty frames before its first marker and after its last, which `notes` then say."""

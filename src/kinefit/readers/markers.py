@@ -140,7 +140,7 @@ def _read_c3d(path: Path, unit: str | None) -> Markers:
     positions = np.where(c3d.missing[..., None], np.nan, c3d.points) * metres
     up = screen if screen in ("x", "y", "z") else None
     try:
-        forces = read_plates(c3d, metres, up)
+        forces = read_plates(c3d, metres, screen if screen.removeprefix("-") in ("x", "y", "z") else None)
     except FileError as error:  # the markers are good all the same
         forces = PlatesRead((), (f"force plates are left out: {error.problem}",))
     return Markers(

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import no_column, rate_of, read_text
+from kinefit._files import no_column, read_text
 from kinefit.errors import FileError
 from kinefit.geometry.force_plates import LEAST_LOAD, ForcePlate
 from kinefit.readers.c3d_file import C3d
@@ -23,6 +23,8 @@ _CHANNELS = {1: 6, 2: 6, 3: 8, 4: 6}  # of each type
 _PER_UNIT = {"": 1.0, "n": 1.0, "nt": 1.0, "nm": 1.0, "nmm": 1e-3, "ntmm": 1e-3, "ncm": 1e-2, "ntm": 1.0, "kn": 1e3}
 _FACTORS = 1e-3, 1e3  # by which a stated unit of moments is wrong, if it is
 _INSIDE, _OUTSIDE = 0.9, 0.5  # share of loaded samples whose centre of pressure lies on a plate: surely, and surely not
+_RESTS = 0.1  # of the range of the load, that a plate shows at rest
+_FAR = 50.0  # [m] from a laboratory's origin: millimetres that are read as metres
 _MARGIN = 0.05  # [m] beyond a plate's edge: errors of a centre of pressure at light loads
 _MOT_REMEDY = "Give a .mot of OpenSim: a line endheader, then time and ground_force_vx, _vy, _vz, _px, _py, _pz."
 _MIN_SIDE = 0.05  # [m]: corners nearer to each other are none
@@ -111,15 +113,15 @@ def _plate(
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     if corners.shape != (4, 3) or not np.all(sides > _MIN_SIDE):
         return None, ["left out: it has no corners"]
-    values, notes = samples[:, columns], list[str]()
+    values = samples[:, columns]
     if kind == 4:
         values = values @ _of(c3d, "CAL_MATRIX", k).T * np.repeat([1.0, metres], 3)  # N, and N times the unit of points
     else:
         values = values * _units(c3d, columns, kind)
-    if (zero := _baseline(c3d, values)) is not None:
-        values = values - zero
+    zero, text = _baseline(c3d, values, kind)
+    values, notes = values - zero, [text] * bool(text)
     placed = lambda values: _placed(kind, values, _of(c3d, "ORIGIN", k), metres, corners, up)
-    rate, start = c3d.rate * c3d.samples, (c3d.first_frame - 1) / c3d.rate
+    rate, start = c3d.rate * c3d.samples, max(c3d.first_frame - 1, 0) / c3d.rate
     plate = ForcePlate(f"plate {k + 1}", corners, rate, start, *placed(values))
     if not (np.isfinite(plate.force).all() and np.isfinite(plate.moment).all()):
         return None, ["left out: its forces are not finite"]
@@ -131,7 +133,7 @@ def _plate(
                 said = "N mm" if factor > 1 else "N m"
                 text = f"its moments are not in {said}, though the file says so: corrected by {factor:g}"
                 return other, [*notes, text]
-        notes.append("its centre of pressure does not lie on it: a wrong type, unit, or corners of another plate")
+        return None, [*notes, "left out: its centre of pressure does not lie on it, by a wrong type, unit or corners"]
     return plate, notes
 
 
@@ -164,15 +166,18 @@ def _units(c3d: C3d, columns: NDArray, kind: int) -> NDArray:
     return np.where((kind == 1) & np.isin(np.arange(len(columns)), (3, 4)), 1.0, factors)
 
 
-def _baseline(c3d: C3d, values: NDArray) -> NDArray | None:
-    """Mean of the frames that ZERO names, if the channels are at rest in them: else somebody stands there."""
+def _baseline(c3d: C3d, values: NDArray, kind: int) -> tuple[NDArray | float, str]:
+    """Mean of the frames that ZERO names, where nobody loads the plate in them; else 0, and why it is not used."""
     zero = c3d.parameters.get("FORCE_PLATFORM:ZERO")
     first, last = (int(v) for v in zero.flat[:2]) if isinstance(zero, np.ndarray) and zero.size >= 2 else (0, 0)
-    if not 0 < first <= last:
-        return None
-    part = values[(first - 1) * c3d.samples : last * c3d.samples]
-    quiet = len(part) and np.all(np.abs(part.mean(axis=0)) < 0.1 * np.maximum(np.ptp(values, axis=0), 1e-12))
-    return part.mean(axis=0) if quiet else None
+    load = values[:, 4:].sum(axis=1) if kind == 3 else values[:, 2]
+    part = slice((first - 1) * c3d.samples, last * c3d.samples)
+    if not 0 < first <= last or not len(load[part]):
+        return 0.0, ""
+    spread = float(np.ptp(load))
+    if abs(load[part].mean()) > _RESTS * spread or load[part].std() > _RESTS * spread:
+        return 0.0, f"frames {first} to {last}, which ZERO names, are under load and not taken for its zero"
+    return values[part].mean(axis=0), ""
 
 
 def _wrench(kind: int, v: NDArray, origin: NDArray, metres: float) -> tuple[NDArray, NDArray]:
@@ -210,29 +215,68 @@ def read_force_file(path: Path) -> PlatesRead:
     start = next((k for k, line in enumerate(lines) if line.strip().lower() == "endheader"), None)
     if start is None or start + 2 >= len(lines):
         raise FileError("no line 'endheader' with a table below", file=path, remedy=_MOT_REMEDY)
-    names = lines[start + 1].split()
-    try:
-        table = np.array([[float(cell) for cell in line.split()] for line in lines[start + 2 :] if line.strip()])
-        columns = dict(zip(names, table.reshape(-1, len(names)).T))
-    except ValueError as error:
-        raise FileError(f"a cell is no number, or is missing ({error})", file=path, remedy=_MOT_REMEDY) from None
+    names, rows = lines[start + 1].split(), list[list[float]]()
     stems = [name.removesuffix("_vx") for name in names if name.endswith("_vx")]
     wanted = [f"{stem}_{kind}{axis}" for stem in stems for kind in "vp" for axis in "xyz"]
-    missing = [name for name in ("time", *wanted) if name not in columns]
+    missing = [name for name in ("time", *wanted) if name not in names]
     if missing or not stems:
         raise FileError(no_column(missing or ["ground_force_vx"], names), file=path, remedy=_MOT_REMEDY)
-    rate = rate_of(columns["time"], path, _MOT_REMEDY)
-    return PlatesRead(tuple(_of_table(stem, columns, rate) for stem in stems), ())
+    for number, line in enumerate(lines[start + 2 :], start + 3):
+        cells = line.split()
+        if not cells:
+            continue
+        try:
+            rows.append([float(cell) for cell in cells])
+        except ValueError:
+            raise FileError("a cell is no number", file=path, place=f"line {number}", remedy=_MOT_REMEDY) from None
+        if len(cells) != len(names):
+            problem = f"{len(cells)} cells for {len(names)} columns"
+            raise FileError(problem, file=path, place=f"line {number}", remedy="Export or copy the file again.")
+    stated = next((re.findall(r"\d+", line) for line in lines[:start] if line.strip().lower().startswith("nrows")), [])
+    if stated and int(stated[0]) > len(rows):
+        problem = f"the file is truncated: {len(rows)} of {stated[0]} rows can be read"
+        raise FileError(problem, file=path, remedy="Export or copy the file again.")
+    columns = dict(zip(names, np.array(rows).T))
+    rate = _even_rate(columns["time"], path)
+    found = [_of_table(stem, columns, rate, path) for stem in stems]
+    return PlatesRead(tuple(plate for plate, _ in found), tuple(text for _, text in found if text))
 
 
-def _of_table(stem: str, columns: dict[str, NDArray], rate: float) -> ForcePlate:
-    """The plate of one set of columns."""
+def _even_rate(times: NDArray, path: Path) -> float:
+    """Rate [Hz] of rows, of whose times (N,) [s] none is more than half a sample off."""
+    rate = (len(times) - 1) / float(times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else np.nan
+    off = np.abs((times - times[0]) * rate - np.arange(len(times)))
+    if not np.all(off < 0.5):
+        place = f"row {int(np.argmax(~(off < 0.5))) + 1}"
+        raise FileError("times that are not evenly spaced", file=path, place=place, remedy="Export it without gaps.")
+    return rate
+
+
+def _of_table(stem: str, columns: dict[str, NDArray], rate: float, path: Path) -> tuple[ForcePlate, str]:
+    """The plate of one set of columns, and what is worth saying of it."""
     force, at = (np.column_stack([columns[f"{stem}_{kind}{axis}"] for axis in "xyz"]) for kind in "vp")
     turning = stem.replace("force", "torque")
     names = [next((n for n in (f"{turning}_{a}", f"{turning}_m{a}") if n in columns), "") for a in "xyz"]
     torque = np.column_stack([columns[name] if name else np.zeros(len(force)) for name in names])
-    loaded = at[force[:, 1] > LEAST_LOAD] if np.any(force[:, 1] > LEAST_LOAD) else np.zeros((1, 3))
-    (x0, y, z0), (x1, _, z1) = loaded.min(axis=0) - _MARGIN, loaded.max(axis=0) + _MARGIN
-    corners = np.array([[x1, y, z0], [x0, y, z0], [x0, y, z1], [x1, y, z1]]) + [0.0, _MARGIN, 0.0]
+    up = int(np.argmax(np.square(np.nan_to_num(force)).sum(axis=0)))
+    on_plate = np.sum(force[:, up] * np.abs(force[:, up])) < 0
+    force, torque = (-force, -torque) if on_plate else (force, torque)
+    stood = force[:, up] > LEAST_LOAD
+    at = np.where(stood[:, None], at, 0.0)  # what stands there without load is no place
+    for what, values in (("force", force), ("centre of pressure", at), ("torque", torque)):
+        if not np.isfinite(values).all():
+            place = f"row {int(np.argmax(~np.isfinite(values).all(axis=1))) + 1}, {stem}"
+            raise FileError(f"a {what} that is no number", file=path, place=place, remedy="Export it without gaps.")
+    if np.abs(at).max() > _FAR:
+        problem = f"a centre of pressure {np.abs(at).max():.0f} m from the origin"
+        raise FileError(problem, file=path, place=stem, remedy="Give metres: OpenSim's unit.")
+    used = at[stood] if stood.any() else np.zeros((1, 3))
+    a, b = (up + 1) % 3, (up + 2) % 3
+    corners = np.tile(used.mean(axis=0), (4, 1))
+    for axis, signs in ((a, (1, -1, -1, 1)), (b, (1, 1, -1, -1))):
+        low, high = used[:, axis].min() - _MARGIN, used[:, axis].max() + _MARGIN
+        corners[:, axis] = [high if sign > 0 else low for sign in signs]
     centre = corners.mean(axis=0)
-    return ForcePlate(stem, corners, rate, float(columns["time"][0]), force, torque + np.cross(at - centre, force))
+    plate = ForcePlate(stem, corners, rate, float(columns["time"][0]), force, torque + np.cross(at - centre, force))
+    moment = np.where(stood[:, None], plate.moment, torque)
+    return replace(plate, moment=moment), f"{stem}: forces on the plate, turned round" if on_plate else ""

@@ -73,7 +73,8 @@ def test_a_body_file_is_named_in_the_take(folder, tmp_path):
     from importlib.resources import files
 
     own = tmp_path / "mine.toml"
-    own.write_text((files("kinefit") / "bodies/toml/catalogue/humanoid10.toml").read_text().replace("humanoid10", "mine"))
+    ten = (files("kinefit.bodies.toml") / "catalogue" / "humanoid10.toml").read_text()
+    own.write_text(ten.replace("humanoid10", "mine"))
     out = tmp_path / "seen"
     told = run(folder / "squat.npz", "-o", out, "--sensor", "tof", "--frames", 0, "--body", own)
     assert told.exit_code == 0, told.output

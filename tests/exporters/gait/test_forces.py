@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from kinefit import fit_marker_subject, fit_markers, load_body, read_markers
 from kinefit.exporters.gait.forces import PERCENT, force_plots, step_forces
 from kinefit.exporters.gait.page import write_gait_page

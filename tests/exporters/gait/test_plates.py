@@ -9,7 +9,7 @@ import pytest
 
 from kinefit import fit_marker_subject, fit_markers, load_body, read_markers, read_motion, write_motion
 from kinefit.exporters import write_c3d, write_forces
-from kinefit.exporters.gait.plates import by_plates, footfalls, plate_findings, standing_mass
+from kinefit.exporters.gait.plates import by_plates, footfalls, plate_findings, standing_mass, stood_on
 from kinefit.exporters.report.feet import foot_events
 from kinefit.readers.plates import read_force_file
 
@@ -109,3 +109,67 @@ def test_who_stands_on_plates_is_weighed(data_dir):
         assert standing_mass([walk], body) is None and standing_mass([], body) is None
         pounds = tuple(replace(p, force=p.force / 4.448) for p in static)
         assert standing_mass([pounds], body) is None
+
+
+def halves(plate):
+    """Two plates in place of one, which meet under the foot on it: first the one bears it, then the other."""
+    loaded = plate.load > 50.0
+    cop = (plate.centre_of_pressure()[loaded] - plate.centre) @ plate.axes.T
+    along = int(np.argmax(np.ptp(cop, axis=0)))
+    edge, ahead = np.median(cop[:, along]), np.sign(cop[-1, along] - cop[0, along])
+    share = np.interp(plate.times, plate.times[loaded][[len(cop) // 3, 2 * len(cop) // 3]], [1.0, 0.0])[:, None]
+    local, out = (plate.corners - plate.centre) @ plate.axes.T, []
+    for name, part, side in (("heel", share, -ahead), ("ball", 1.0 - share, ahead)):
+        mine = local.copy()
+        inner = np.sign(mine[:, along]) != side
+        mine[inner, along] = edge
+        corners = plate.centre + mine @ plate.axes
+        moment = plate.moment - np.cross(corners.mean(axis=0) - plate.centre, plate.force)
+        out.append(replace(plate, name=name, corners=corners, force=part * plate.force, moment=part * moment))
+    return out
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_one_foot_on_two_plates_is_one_step(walk, order):
+    whole = footfalls(walk)[0]
+    plate = next(p for p in walk.plates if p.name == whole.plate)
+    (found,) = footfalls(replace(walk, plates=tuple(halves(plate)[::order])))
+    assert found.side == whole.side and set(found.plate.split(", ")) == {"heel", "ball"}
+    assert [found.contact, found.off] == pytest.approx([whole.contact, whole.off], abs=0.005)
+
+
+def test_half_a_foot_on_a_plate_is_no_step(walk):
+    plate = next(p for p in walk.plates if p.name == footfalls(walk)[0].plate)
+    assert [footfalls(replace(walk, plates=(half,))) for half in halves(plate)] == [[], []]
+
+
+def test_events_of_a_late_clock_are_not_used(walk):
+    late = replace(walk, plates=tuple(plate.shifted(0.3) for plate in walk.plates))
+    alone, used = foot_events(late, plates=False), foot_events(late)
+    np.testing.assert_array_equal(alone.left.contacts, used.left.contacts)
+    assert foot_events(walk).left.contact_std.min() < alone.left.contact_std.min()
+
+
+def test_a_plate_elsewhere_has_no_explanation(walk):
+    far = replace(walk, plates=tuple(replace(p, corners=p.corners + [0.0, 0.0, 0.0]) for p in walk.plates))
+    rng = np.random.default_rng(0)
+    moved = tuple(replace(p, moment=p.moment + rng.normal(scale=150.0, size=p.moment.shape)) for p in far.plates)
+    found = plate_findings(replace(far, plates=moved), events_of(walk))
+    assert found and all("neither a shift nor a turn" in f.confidence for f in found)
+
+
+def test_of_several_people_each_has_the_own_plates(walk):
+    assert len(stood_on(walk)) == 2
+    beside = replace(walk, plates=tuple(replace(p, corners=p.corners + [1.5, 1.5, 0.0]) for p in walk.plates))
+    assert not stood_on(beside)
+
+
+def test_forces_of_plates_with_clocks_of_their_own(walk, tmp_path):
+    first, second = walk.plates
+    other = second.at(np.arange(second.times[0], second.times[-1] + 0.4, 1.0 / 700.0))
+    write_forces(replace(walk, plates=(first, other)), tmp_path / "forces.mot")
+    found = read_force_file(tmp_path / "forces.mot").plates
+    assert found[0].times[-1] >= second.times[-1] + 0.39
+    stood = found[1].load > 100.0
+    wanted = second.at(found[1].times)
+    assert np.abs(found[1].load - wanted.load)[stood].max() < 40.0  # of 60 N/ms between samples of 700 Hz

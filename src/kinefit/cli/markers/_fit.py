@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kinefit.bodies import Body, PointSet, load_body
-from kinefit.bodies.marker_sets import bare, find_marker_set, load_marker_set, matched, read_sides
+from kinefit.bodies.marker_sets import bare, find_marker_set, load_marker_set, matched
 from kinefit.bodies.motion import Motion, rotation_between_up
 from kinefit.cli import _screen
 from kinefit.cli._screen import Step, check_file, note
@@ -270,7 +270,7 @@ def fit_file(
         and right are wrong (see `label_findings`).
     """
     from kinefit.exporters import write_markers, write_osim, write_trc
-    from kinefit.exporters.gait.plates import standing_mass
+    from kinefit.exporters.gait.plates import standing_mass, stood_on
     from kinefit.exporters.report.feet import plate_faults
     from kinefit.exporters.report.report import write_report
     from kinefit.fitting.markers.sides import label_findings, refuse_wrong_sides
@@ -310,7 +310,9 @@ def fit_file(
         motion = fit_markers(
             subject, markers, limits=options.limits, up=options.up, smooth=options.smooth, progress=step
         )
-        if len(people) == 1 and options.mass is None:
+        if len(people) > 1:
+            motion = replace(motion, plates=stood_on(motion))
+        elif options.mass is None:
             motion = motion.with_mass(standing_mass([trial.plates if trial else (), markers.plates], motion.body))
         findings = [*faults_of(found_labels), *motion_findings(motion, options.height), *plate_faults(motion)]
         motion = replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings)})
@@ -368,6 +370,5 @@ def read_people(file: Path, unit: str | None, sides: str | None = None) -> dict[
     markers = read_file(file, unit)
     if sides:
         with located(file):
-            names, positions = read_sides(markers.names, markers.positions, sides)
-        markers = replace(markers, names=names, positions=positions)
+            markers = markers.sided(sides)
     return split_people(markers)

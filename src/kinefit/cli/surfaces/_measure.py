@@ -86,6 +86,9 @@ def read_views(calibration: Path, unit: str, views: Sequence[str], fewest: int =
             videos.append(place)
     if len(names) < fewest or (photographs and videos) or len({len(files) for files in photographs}) > 1:
         counts = ", ".join(str(len(files)) for files in photographs)
+        if not names:
+            remedy = "Give the calibration first, or --flat with the millimetres of a pixel for one video."
+            raise ObservationError("no views", remedy=remedy)
         problem = f"these {len(names)} views do not go together: {len(videos)} videos, photographs: {counts or 'none'}"
         raise ObservationError(problem, remedy="Give at least two views: all videos, or all with as many photographs.")
     if photographs:

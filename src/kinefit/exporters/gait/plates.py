@@ -23,19 +23,25 @@ FOOT = "heel", "metatarsal_phalanx_1", "metatarsal_phalanx_5"
 GRAVITY = 9.81
 """[m/s²]"""
 
+Events = Sequence[tuple[NDArray, NDArray]]
+"""Contacts (N,) and toe-offs (M,) [s] of the left and of the right foot."""
+
 CONTACT_STD_S = 0.003
 """[s] that a load takes to rise to 20 N at the 5 to 10 kN/s of a heel."""
 
 _MIN_STEP_S, _MIN_PEAK = 0.1, 40.0  # [s], [N]: shorter or lighter, it is no step
 _MAX_OFF = 0.12  # [m] of the centre of pressure from the line between heel and ball: half a foot's width and its toes
+_WHOLE = 0.9  # of the time, and of a foot's points, over a plate
 _NEARER = 0.05  # [m] by which the other foot is farther away, so that it is known whose step it is
 _EDGE = 0.03  # [m] beyond a plate's edge: the skin and errors of landmarks
 _MOVING = 0.5  # [m/s] of a foot that swings past the other: it stands on nothing
 _BESIDE, _RIGHT = 0.06, 0.04  # [m] from the foot in the median: surely wrong, and surely right once it is corrected
+_ELSEWHERE = 0.3  # [m]: about a foot's length beside it, somebody or something else stands there
 _BETTER = 0.4  # of the distance before, once it is corrected
 _SAME_S = 0.12  # [s] between an event of a plate and that of the motion which is the same
+_STRIDE_S = 0.4  # [s] from an event to the next one of its kind and foot, at least: sprinters take 0.45 s
 _LATE_S, _MAX_SPREAD_S = 0.05, 0.03  # [s]: events by the feet's speed are right to 12 ms
-_STAND_S, _STEADY, _DOUBT = 0.5, 0.02, 3.0  # [s] of standing still, as the relative deviation of the load says; sigmas
+_STAND_S, _STEADY, _DOUBT = 0.5, 0.02, 2.0  # [s] of standing still, as the relative deviation of the load says; sigmas
 _LOADS = 0.45, 12.0  # [body weights] of the largest load: a step that is not whole, a landing
 
 
@@ -101,26 +107,34 @@ class _Loaded:
 
 def footfalls(motion: Motion) -> list[Footfall]:
     """Steps of one foot alone on a plate, or on several plates, in the order of their contacts."""
-    found: list[Footfall] = []
-    for one in _loaded(motion):
+    steps: list[tuple[int, float, float, list[_Loaded]]] = []  # side, first and last time under load
+    for one in sorted(_loaded(motion), key=lambda one: float(one.plate.times[one.first])):
         if (side := _side(one)) is None:
             continue
-        step = Footfall(one.plate.name, ("left", "right")[side], one.time_of(one.first), one.time_of(one.stop))
-        other = next((f for f in found if f.side == step.side and _overlap(f, step)), None)
-        whole = one.is_over(side).mean() > 0.9
-        if other is not None:
-            found.remove(other)
-            times = np.fmin(other.contact, step.contact), np.fmax(other.off, step.off)
-            step = Footfall(f"{other.plate}, {step.plate}", step.side, float(times[0]), float(times[1]))
-        elif not whole:
-            step = Footfall(step.plate, step.side, np.nan, np.nan)  # until the rest of it is found on another plate
-        found.append(step)
-    known = [f for f in found if np.isfinite([f.contact, f.off]).any()]
-    return sorted(known, key=lambda f: np.nan_to_num(f.contact, nan=f.off))
+        start, stop = float(one.plate.times[one.first]), float(one.plate.times[one.stop - 1])
+        same = next((k for k, (s, _, last, _) in enumerate(steps) if s == side and start <= last), None)
+        if same is None:
+            steps.append((side, start, stop, [one]))
+        else:
+            _, first, last, parts = steps[same]
+            steps[same] = side, min(first, start), max(last, stop), [*parts, one]
+    return [_footfall(side, parts) for side, _, _, parts in steps if _is_whole(side, parts)]
 
 
-def _overlap(a: Footfall, b: Footfall) -> bool:
-    return not (a.off < b.contact or b.off < a.contact)
+def _is_whole(side: int, parts: Sequence[_Loaded]) -> bool:
+    """Whether every point of a foot is over one of the plates that it loads."""
+    if len(parts) == 1:
+        return bool(parts[0].is_over(side).mean() > _WHOLE)
+    over = [one.is_over(side).mean(axis=0) for one in parts]  # of each plate, by point
+    return bool(np.max(over, axis=0).min() > _WHOLE)
+
+
+def _footfall(side: int, parts: Sequence[_Loaded]) -> Footfall:
+    """A step with its first contact and its last toe-off."""
+    first = min(parts, key=lambda one: one.plate.times[one.first])
+    last = max(parts, key=lambda one: one.plate.times[one.stop - 1])
+    names = ", ".join(dict.fromkeys(one.plate.name for one in parts))
+    return Footfall(names, ("left", "right")[side], first.time_of(first.first), last.time_of(last.stop))
 
 
 def _side(one: _Loaded) -> int | None:
@@ -159,7 +173,7 @@ def standing_mass(trials: Sequence[Sequence[ForcePlate]], body: Body) -> float |
     """[kg] of a person who stands still with all weight on plates in the first trial that shows it; None without one.
 
     Plates of each trial. The load is steady to 2 % for half a second or more, and the mass is one that people of the
-    stature have: what else stands on plates, or beside them with one foot, is far from it.
+    stature have, within two standard deviations. Who stands on plates with one of two feet is lighter than most.
     """
     return next((mass for plates in trials if plates and (mass := _standing(plates, body))), None)
 
@@ -194,40 +208,56 @@ def by_plates(steps: Sequence[Footfall], side: str, end: str, times: NDArray, st
     """
     found = [(getattr(step, end), CONTACT_STD_S) for step in steps if step.side == side]
     found = [(time, std) for time, std in found if np.isfinite(time)]
+    odd = [any(_SAME_S < abs(t - time) < _STRIDE_S for t in times) for time, _ in found]
+    alike = [any(abs(t - time) <= _SAME_S for t in times) for time, _ in found]
+    found = [pair for pair, far, same in zip(found, odd, alike) if same or not far]
     kept = [pair for pair in zip(times, stds) if all(abs(pair[0] - time) > _SAME_S for time, _ in found)]
     table = np.array(sorted([*kept, *found])).reshape(-1, 2)
     return table[:, 0], table[:, 1]
 
 
-def plate_findings(motion: Motion, events: Sequence[tuple[NDArray, NDArray]]) -> list[Finding]:
-    """What is wrong with plates: moved, turned, late, or of another unit, as the feet and the load tell.
+def lateness(motion: Motion, events: Events) -> tuple[float, float, int] | None:
+    """[s] of the plates' clock beside the motion's, with its deviation and the number of events; None if it is right.
 
     Parameters
     ----------
     events : contacts (N,) and toe-offs (M,) [s] of the left and of the right foot, as its motion tells them
     """
-    out, loaded = [], list(_loaded(motion))
-    weight = GRAVITY * float(segment_masses(motion.body).masses.sum())
-    for plate in motion.plates:
-        own = [one for one in loaded if one.plate is plate]
-        if not own:
-            continue
-        peak = max(float(one.plate.load[one.first : one.stop].max()) for one in own) / weight
-        if not _LOADS[0] < peak < _LOADS[1] and len(loaded) > 1:
-            text = f"The largest load on {plate.name} is {peak:.2g} body weights: its forces are not in newtons."
-            out.append(_finding(text, "Likely; a person who only touches it does the same.", "unit"))
-        elif text := _misplaced(own):
-            out.append(_finding(text, "Likely: so corrected, each step lies under its foot.", "corners"))
-    late = np.array([off for one in loaded for off in _lateness(one, events)])
+    late = np.array([off for one in _loaded(motion) for off in _lateness(one, events)])
     spread = 1.48 * float(np.median(np.abs(late - np.median(late)))) if len(late) else np.inf
-    if len(late) > 1 and abs(np.median(late)) > _LATE_S and spread < _MAX_SPREAD_S:
-        std = max(spread, 0.012) / np.sqrt(len(late))
-        text = f"The plates' clock is {np.median(late):+.3f} ± {std:.3f} s beside that of the motion."
-        out.append(_finding(text, f"Likely, by {len(late)} contacts and toe-offs.", "time_offset"))
+    if len(late) < 2 or abs(np.median(late)) < _LATE_S or spread > _MAX_SPREAD_S:
+        return None
+    return float(np.median(late)), max(spread, 0.012) / float(np.sqrt(len(late))), len(late)
+
+
+def plate_findings(motion: Motion, events: Events) -> list[Finding]:
+    """What is wrong with plates: moved, turned, late, or of another unit, as the feet and the load tell.
+
+    `events` as of `lateness`.
+    """
+    out, loaded = list[Finding](), list(_loaded(motion))
+    if not loaded:
+        return out
+    weight = GRAVITY * float(segment_masses(motion.body).masses.sum())
+    times = loaded[0].plate.times
+    total = np.sum([np.interp(times, plate.times, plate.load, 0.0, 0.0) for plate in motion.plates], axis=0)
+    peak = float(total.max()) / weight
+    if not _LOADS[0] < peak < _LOADS[1] and len(loaded) > 1:
+        text = f"The largest load on the plates is {peak:.2g} body weights: their forces are not in newtons."
+        out.append(_finding(text, "Likely; a person who only touches them does the same.", "ANALOG:UNITS or SCALE"))
+    else:
+        for plate in motion.plates:
+            own = [one for one in loaded if one.plate is plate]
+            text, confidence = _misplaced(own) if own else ("", "")
+            out += [_finding(text, confidence, "CORNERS, or shift and turn of its [[plate]]")] * bool(text)
+    if (late := lateness(motion, events)) is not None:
+        apart = f"{late[0]:+.3f} ± {late[1]:.3f} s"
+        text = f"The plates' clock is {apart} beside that of the motion: no event is taken of them."
+        out.append(_finding(text, f"Likely, by {late[2]} contacts and toe-offs.", "time_offset of its [[plate]]"))
     return out
 
 
-def _lateness(one: _Loaded, events: Sequence[tuple[NDArray, NDArray]]) -> Iterator[float]:
+def _lateness(one: _Loaded, events: Events) -> Iterator[float]:
     """[s] from the nearest events of the foot that stands on a plate to those of its load."""
     apart = np.median(np.linalg.norm(one.offsets, axis=-1), axis=0)
     if apart.min() < _MAX_OFF:
@@ -236,24 +266,35 @@ def _lateness(one: _Loaded, events: Sequence[tuple[NDArray, NDArray]]) -> Iterat
                 yield float(min(time - times, key=abs))
 
 
-def _finding(text: str, confidence: str, key: str) -> Finding:
-    remedy = f"Correct the {key} of its [[plate]], or of the group FORCE_PLATFORM in the C3D."
-    return Finding("doubt", "plates", text, (), confidence, remedy)
+def _finding(text: str, confidence: str, what: str) -> Finding:
+    return Finding("doubt", "plates", text, (), confidence, f"Correct {what}.")
 
 
-def _misplaced(own: list[_Loaded]) -> str:
-    """How a plate lies beside where it is said to lie; "" where it does not, or nothing explains it."""
+def stood_on(motion: Motion) -> tuple[ForcePlate, ...]:
+    """The plates on which this person stands: of a recording of several people."""
+    own = {
+        one.plate.name for one in _loaded(motion)
+        if np.median(np.linalg.norm(one.offsets, axis=-1), axis=0).min() < _MAX_OFF
+    }  # fmt: skip
+    return tuple(plate for plate in motion.plates if plate.name in own)
+
+
+def _misplaced(own: list[_Loaded]) -> tuple[str, str]:
+    """How a plate lies beside where it is said to lie, and how sure that is; empty where it does not."""
     turns = {"turned by 180 degrees": (-1, -1), "mirrored along x": (-1, 1), "mirrored along y": (1, -1)}
     nearest = lambda one, cop: min(np.moveaxis(one.offsets_of(cop), 1, 0), key=lambda e: np.median(np.hypot(*e.T)))
     distance = lambda offsets: float(np.median(np.hypot(*np.concatenate(offsets).T)))
     as_said = [nearest(one, one.cop) for one in own]
     before = distance(as_said)
     if before < _BESIDE:
-        return ""
+        return "", ""
     shift = np.median(np.concatenate(as_said), axis=0)
     found = {how: distance([nearest(one, one.cop * signs) for one in own]) for how, signs in turns.items()}
     found[f"shifted by {100 * np.hypot(*shift):.0f} cm"] = distance([nearest(one, one.cop - shift) for one in own])
     good = [how for how, after in found.items() if after < min(_RIGHT, _BETTER * before)]
-    if not good:
-        return ""
-    return f"{own[0].plate.name} is {' or '.join(good)}: its centre of pressure is {100 * before:.0f} cm from the foot."
+    name, far = own[0].plate.name, f"its centre of pressure is {100 * before:.0f} cm from the nearest foot"
+    if good:
+        return f"{name} is {' or '.join(good)}: {far}.", "Likely: so corrected, each step lies under its foot."
+    if before < _ELSEWHERE:
+        return "", ""
+    return f"{name} does not lie under the feet: {far}.", "Certain; neither a shift nor a turn explains it."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -320,12 +321,20 @@ def _describe_plates(draft: Draft, files: Sequence[Path], markers: Path | None) 
         if path.suffix.lower() in (".mot", ".sto"):
             with suppress(KinefitError):  # a table of angles
                 forces[path] = read_force_file(path).plates
-    named = [path for path in forces if markers is not None and path.stem.startswith(markers.stem)]
+    trials = [path for path in files if path.suffix.lower() in (".trc", ".c3d")]
+    of_trial = {
+        path: max((t for t in trials if re.fullmatch(rf"{re.escape(t.stem)}(\W|_|$).*", path.stem)),
+                  key=lambda t: len(t.stem), default=None)
+        for path in forces
+    }  # fmt: skip
+    named = [path for path in forces if of_trial[path] == markers]
     for path, plates in forces.items():
-        is_used = path in (named or list(forces))[: 1 if named or len(forces) == 1 else 0]
-        file = Value(path, "likely", f"{len(plates)} force plates, {plates[0].rate:g} Hz, y up")
-        draft.tables["plate"].append((is_used, {"file": file}))
-        draft.note("plates", "likely", f"{draft.name(path)}: ground forces{'' if is_used else ', as a comment'}")
+        alone = len(forces) == 1 and of_trial[path] is None
+        is_used = path in named[:1] or alone
+        why = f"{len(plates)} force plates, {plates[0].rate:g} Hz" + (", the only forces here" if alone else "")
+        sure = "guess" if alone else "likely"
+        draft.tables["plate"].append((is_used, {"file": Value(path, sure, why)}))
+        draft.note("plates", sure, f"{draft.name(path)}: ground forces{'' if is_used else ', as a comment'}")
 
 
 _ALIGNED = "aligned"  # in the name of a topic with the same depth, warped to another camera

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.bodies.marker_sets import read_sides
+from kinefit.bodies.motion import UP_AXES
 from kinefit.errors import FileError, ObservationError, TakeError, command, located
 from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
@@ -34,7 +34,7 @@ from kinefit.readers.landmarks.detections import detections_file, read_detection
 from kinefit.readers.landmarks.keypoint_sets import FACE_SET
 from kinefit.readers.landmarks.keypoints import read_keypoints
 from kinefit.readers.markers import read_markers
-from kinefit.readers.plates import read_force_file
+from kinefit.readers.plates import PlatesRead, read_force_file
 from kinefit.readers.take.cameras import (
     TakeCameras,
     assumed_camera,
@@ -64,6 +64,7 @@ from kinefit.readers.take.skin import load_skin
 from kinefit.readers.videos.video import Video, common_frames
 
 _MIN_COMMON_FRAMES = 10  # without a calibration: fewer tell neither clocks nor places of cameras
+_LEVEL_COSINE = 0.5  # of a plate's normal and the take's vertical axis: ramps and stairs are within 60 degrees
 _LEVEL = 45.0  # [deg] turned by less, the axis of a marker file that was vertical still is the nearest to it
 
 
@@ -228,7 +229,12 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         streams[stream] = times + of_cameras.offset(source.camera)
         keypoints.append((read, streams[stream]))
     plates = [plate.shifted(e.time_offset) for e, m in zip(take.markers, markers) for plate in m.plates]
-    plates += [plate for each in read_each(take, take.plates, _read_plates) for plate in each]
+    of_files = read_each(take, take.plates, partial(_read_plates, up=take.up))
+    plates += [plate for read in of_files for plate in read.plates]
+    notes += [f"[[plate]]: {text}" for read in of_files for text in read.notes]
+    if len(once := _different(plates)) < len(plates):
+        notes.append(f"{len(plates) - len(once)} force plates are named twice and count once")
+    plates = once
     deep = read_each(take, take.depth, partial(load_depth, cameras=of_cameras))
     depth = tuple(video for video in deep if isinstance(video, DepthVideo))
     clouds = tuple(video for video in deep if isinstance(video, CloudVideo))
@@ -270,7 +276,8 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     kinds = {LineVideo: "lines of camera ", KeypointVideo: "keypoints of camera ", DepthVideo: "depth ",
              CloudVideo: "depth "}  # fmt: skip
     others = [(f"{kinds.get(type(r), '')}{r.sensor}", r.times) for r in (*recordings, *skin)]
-    _check_times([*others, *marked], frames, rate, take)
+    clocks_of_plates = [(plate.name, plate.times - first_time) for plate in plates]
+    _check_times([*others, *marked, *clocks_of_plates], frames, rate, take)
     notes += [
         f"{place}: {Path(m.source).name} begins at {times[0]:.6g} s of the take, by its own clock and time_offset"
         for (place, times), m in zip(marked, markers) if m.first_time
@@ -346,11 +353,7 @@ def _read_keypoints(source: KeypointsEntry, cameras: TakeCameras, number: int) -
 def _read_markers(entry: MarkersEntry, file: Path) -> Markers:
     """The marker recording of an entry, or its static trial, in the take's world."""
     markers = read_markers(file, unit=entry.unit)
-    if entry.sides:
-        names, positions = read_sides(markers.names, markers.positions, entry.sides)
-        markers = replace(markers, names=names, positions=positions)
-    if str(entry.sides).startswith("mirrored"):
-        markers = replace(markers, plates=())  # nothing says whether they are mirrored, too
+    markers = markers.sided(entry.sides) if entry.sides else markers
     if not (any(entry.shift) or any(entry.turn)):
         return markers
     T, up = entry.T_world_file, markers.up if max(abs(v) for v in entry.turn) < _LEVEL else None
@@ -358,16 +361,34 @@ def _read_markers(entry: MarkersEntry, file: Path) -> Markers:
     return replace(markers, positions=se3.apply(T, markers.positions), up=up, plates=plates)
 
 
-def _read_plates(entry: PlateEntry) -> tuple[ForcePlate, ...]:
+def _read_plates(entry: PlateEntry, up: str) -> PlatesRead:
     """Force plates of a file of their own, in the take's world and by its clock."""
     if entry.file.suffix.lower() == ".c3d":
-        found = read_markers(entry.file).plates
+        markers = read_markers(entry.file)
+        found = PlatesRead(markers.plates, tuple(text for text in markers.notes if "force plate" in text))
     else:
-        found = read_force_file(entry.file).plates
-    if not found:
-        remedy = "Name the C3D of the trial, or its ground forces as .mot."
-        raise FileError("no force plates in this file", file=entry.file, remedy=remedy)
-    return tuple(plate.moved(entry.T_world_file).shifted(entry.time_offset) for plate in found)
+        found = read_force_file(entry.file)
+    if not found.plates:
+        why, remedy = "; ".join(found.notes), "Name the C3D of the trial, or its ground forces as .mot."
+        problem = f"no force plates in this file{why and f': {why}'}"
+        raise FileError(problem, file=entry.file, remedy=remedy)
+    moved = tuple(plate.moved(entry.T_world_file).shifted(entry.time_offset) for plate in found.plates)
+    for plate in moved:
+        if plate.normal @ UP_AXES[up] < _LEVEL_COSINE:
+            axis = "xyz"[int(np.argmax(np.abs(plate.normal)))]
+            problem = f"{plate.name} bears its load along {axis}, and the take's up is {up}"
+            remedy = 'Turn it: turn = [90.0, 0.0, 0.0] takes a file that is y up into a take with up = "z".'
+            raise FileError(problem, file=entry.file, remedy=remedy)
+    return PlatesRead(moved, found.notes)
+
+
+def _different(plates: Sequence[ForcePlate]) -> list[ForcePlate]:
+    """Each plate once: of two with the same corners and forces the first."""
+    out = list[ForcePlate]()
+    for plate in plates:
+        same = (np.array_equal(plate.force, one.force) and np.allclose(plate.corners, one.corners) for one in out)
+        out += [] if any(same) else [plate]
+    return out
 
 
 def _named_apart(plates: Sequence[ForcePlate]) -> tuple[ForcePlate, ...]:

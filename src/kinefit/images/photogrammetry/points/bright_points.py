@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.errors import ObservationError
 from kinefit.geometry.lines import triangulate
 from kinefit.images.photogrammetry.spline_image import SplineImage
 from kinefit.images.photogrammetry.surface_tracking import SurfacePoints, SurfaceTracker
@@ -83,6 +84,10 @@ class BrightPointTracker(SurfaceTracker):
     def _measure_first(self, images: Sequence[SplineImage]) -> SurfacePoints:
         spots = self._find(images)
         if self.mask is not None:
+            if self.mask.shape != images[0].size[::-1]:
+                has, wanted = ("x".join(map(str, size)) for size in (self.mask.shape[::-1], images[0].size))
+                remedy = "Give a mask of the first camera's images."
+                raise ObservationError(f"a mask of {has} px for images of {wanted} px", remedy=remedy)
             u, v = np.rint(spots[0]).astype(int).T
             spots[0] = spots[0][self.mask[v, u]]
         return self._associated(spots)
