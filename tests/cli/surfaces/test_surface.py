@@ -374,6 +374,8 @@ def test_one_camera_follows_points_on_a_body_whose_motion_is_given(tmp_path):
         (["{0}/a.avi", "--flat", "1", "--motion", "m.npz"], "need a calibration"),
         (["{0}/calib.toml", "a={0}/a.avi", "b={0}/b.avi", "--bright", "9", "--motion", "m.npz"], "--bright has none"),
         (["{0}/calib.toml", "a={0}/a", "b={0}/b", "--bright", "9"], "--bright needs videos"),
+        (["{0}/a.avi", "--flat", "1", "--bright", "9", "--window", "21"], "--window needs texture"),
+        (["{0}/a.avi", "--bright", "9"], "no views"),
         (["{0}/calib.toml", "a={0}/a", "b={0}/b", "--reach", "9"], "--reach needs videos"),
     ],
 )

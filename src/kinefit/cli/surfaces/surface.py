@@ -88,7 +88,10 @@ def surface(
         "--motion": motion, "--bounds": bounds, "--bright": bright, "--reach": reach, "--neighbours": neighbours or None
     }  # fmt: skip
     of_videos = [name for name, value in videos_alone.items() if value is not None]
-    for name, value in (("--motion", motion), ("--seeds", seeds)):
+    source = click.get_current_context().get_parameter_source
+    stated = {f"--{n}" for n in ("window", "step") if source(n) is click.core.ParameterSource.COMMANDLINE}
+    textured = {"--motion": motion, "--seeds": seeds, "--least": least, **dict.fromkeys(stated, True)}
+    for name, value in textured.items():
         if value is not None and bright is not None:
             raise ObservationError(f"{name} needs texture, --bright has none", remedy="Leave out one of them.")
     one_video = flat is not None and not views and calibration.suffix.lower() not in PHOTOGRAPHS
