@@ -61,14 +61,14 @@ def run() -> None:
         records.append(cycles is not None and cycles.kind == "gait")
         if name in CHOSEN:
             continue
-        for source, events in (("files", _own(markers)), ("plates", _plates(path, markers))):
+        for source, events in (("files", _own(markers)), ("plates", plate_events(path, markers))):
             for event in events:
-                off.setdefault((source, event.kind), []).append(_missed(motion, event))
+                off.setdefault((source, event.kind), []).append(missed(motion, event))
         steps += _steps(motion, markers)
         found = [(step.side[0], time) for step in footfalls(measured) for time in (step.contact, step.off)]
         plated += [
             any(side == event.foot and abs(time - event.time) < _SAME_S for side, time in found)
-            for event in _plates(path, markers)
+            for event in plate_events(path, markers)
         ]  # fmt: skip
     for source in ("plates", "files"):
         for kind in ("contact", "off"):
@@ -120,7 +120,7 @@ def _own(markers: Markers) -> list[Event]:
     ]  # fmt: skip
 
 
-def _plates(path: Path, markers: Markers) -> list[Event]:
+def plate_events(path: Path, markers: Markers) -> list[Event]:
     """Events by force plates under one foot."""
     out = []
     for times, forces, centre in plates_of(path):
@@ -170,7 +170,7 @@ def _index(markers: Markers, label: str) -> int:
     return next(i for i, name in enumerate(markers.names) if name.rpartition(":")[2] == label)
 
 
-def _missed(motion: Motion, event: Event) -> tuple[float, float]:
+def missed(motion: Motion, event: Event) -> tuple[float, float]:
     """[s] how much later the motion has an event, with the standard deviation that it says; NaN without one near."""
     feet = foot_events(motion)
     foot = feet and (feet.left if event.foot == "l" else feet.right)
