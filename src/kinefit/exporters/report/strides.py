@@ -24,6 +24,8 @@ _LEAST_SHARE = 0.3  # of the stature, of a stride that goes anywhere: shorter on
 
 _SETTLED = 0.1  # of a stride after contact: the heel slides no more, and does not rise yet
 
+_BACK = "calcaneus_posterior"  # where laboratories measure steps; of a body without this landmark the heel's sole
+
 Term = tuple[str, int, float]  # landmark, frame, weight
 
 
@@ -117,7 +119,7 @@ def step_quantities(motion: Motion, feet: Feet, side: str, start: float, stop: f
     way = ground.sum_of([(f"{s}_hip", at, sign * 0.5) for s in "lr" for at, sign in ((end, 1.0), (begin, -1.0))])
     if float(np.linalg.norm(way)) > 0.5 * _LEAST_SHARE * (motion.body.stature or 1.7):
         along = way / np.linalg.norm(way)
-        step: list[Term] = [(f"{side[0]}_{HEEL}", end, 1.0), (f"{other.side[0]}_{HEEL}", begin, -1.0)]
+        step: list[Term] = [(ground.heel(side), end, 1.0), (ground.heel(other.side), begin, -1.0)]
         out["step length [m]"] = float(ground.sum_of(step) @ along), ground.std_of(step, along)
     return out
 
@@ -139,7 +141,7 @@ def _lengths(
     """Of a stride of foot "l" or "r", in which the other one lands and this one leaves the ground at times [s]."""
     ground, settled = _Ground(motion, feet.belt), _SETTLED * (stop - start)
     begin, end = (ground.frame(t + settled) for t in (start, stop))
-    heel, opposite = f"{side}_{HEEL}", f"{'r' if side == 'l' else 'l'}_{HEEL}"
+    heel, opposite = ground.heel(side), ground.heel("r" if side == "l" else "l")
     stride: list[Term] = [(heel, end, 1.0), (heel, begin, -1.0)]
     moved = ground.sum_of(stride)
     length = float(np.linalg.norm(moved))
@@ -175,6 +177,11 @@ class _Ground:
 
     def frame(self, time: float) -> int:
         return int(np.argmin(np.abs(self._motion.times - time)))
+
+    def heel(self, side: str) -> str:
+        """The landmark of a side's heel by which lengths are measured."""
+        names = (f"{side[0]}_{name}" for name in (_BACK, HEEL))
+        return next(name for name in names if name in self._motion.body.landmarks.names)
 
     def sum_of(self, terms: Sequence[Term]) -> NDArray:
         """(2,) [m] weighted sum of landmarks in some frames."""
