@@ -17,9 +17,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from benchmarks.accuracy.gait.gait_events import PRINTED, Event, file_of, fitted, missed, plate_events
+from benchmarks.accuracy.gait.gait_events import PRINTED, Event, file_of, fitted, missed, plate_events, print_events, print_held
 from benchmarks.accuracy.mixed.mixed_takes import camera_error, detected, with_own_keypoints
 from benchmarks.figures import amount, figure
 from kinefit import Motion, track_take
@@ -54,14 +53,11 @@ def run() -> None:
     for kind, goal in (("step", "<= 16"), ("stride", "<= 12")):
         error, std = 1e3 * np.array(lengths[kind]).reshape(-1, 2).T
         print(f"# {len(error)} {kind}s")
-        figure(f"gait_video_{kind}_mm", rms(error), "mm RMS", goal, reason)
+        rms = float(np.sqrt(np.mean(np.square(error)))) if len(error) else None
+        figure(f"gait_video_{kind}_mm", rms, "mm RMS", goal, reason)
         print_held(f"gait_video_{kind}", error, std, reason)
     for kind, pairs in times.items():
-        error, std = 1e3 * np.array(pairs).reshape(-1, 2).T
-        known = np.isfinite(error)
-        print(f"# {known.sum()} of {len(error)} events found: {kind}")
-        figure(f"gait_video_{kind}_ms", rms(error[known]), "ms RMS", "<= 16", reason)
-        print_held(f"gait_video_{kind}", error[known], std[known], reason)
+        print_events(f"gait_video_{kind}", np.array(pairs).reshape(-1, 2))
 
 
 def of_draw(measured: Motion, draw: int) -> tuple[Motion, Motion]:
@@ -112,14 +108,3 @@ def _of_events(motion: Motion, events: list[Event], start: float) -> dict[str, l
         out.setdefault(event.kind, []).append(missed(motion, replace(event, time=event.time - start)))
     return out
 
-
-def rms(error: NDArray) -> float | None:
-    """Root mean square; None of none."""
-    return float(np.sqrt(np.mean(np.square(error)))) if len(error) else None
-
-
-def print_held(name: str, error: NDArray, std: NDArray, reason: str) -> None:
-    """Share of errors within two of their standard deviations: at least, and at most."""
-    share = 100.0 * float(np.mean(np.abs(error) <= 2.0 * std)) if len(error) else None
-    figure(f"{name}_held_least", share, "% within 2 sigma", ">= 90", reason)
-    figure(f"{name}_held_most", share, "% within 2 sigma", "<= 98", reason)
