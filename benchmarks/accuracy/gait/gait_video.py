@@ -18,7 +18,16 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.accuracy.gait.gait_events import PRINTED, Event, file_of, fitted, missed, plate_events, print_events, print_held
+from benchmarks.accuracy.gait.gait_events import (
+    PRINTED,
+    Event,
+    file_of,
+    fitted,
+    missed,
+    plate_events,
+    print_events,
+    print_held,
+)
 from benchmarks.accuracy.mixed.mixed_takes import camera_error, detected, with_own_keypoints
 from benchmarks.figures import amount, figure
 from kinefit import Motion, track_take

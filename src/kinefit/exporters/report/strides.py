@@ -24,8 +24,6 @@ _LEAST_SHARE = 0.3  # of the stature, of a stride that goes anywhere: shorter on
 
 _SETTLED = 0.1  # of a stride after contact: the heel slides no more, and does not rise yet
 
-_BACK = "calcaneus_posterior"  # where laboratories measure steps; of a body without this landmark the heel's sole
-
 Term = tuple[str, int, float]  # landmark, frame, weight
 
 
@@ -162,7 +160,7 @@ def _lengths(
         out["step width [m]"] = float(ground.sum_of(beside) @ outward), ground.std_of(beside, outward)
     if off is not None:
         middle = ground.frame(0.5 * (start + off))
-        foot: list[Term] = [*((f"{side}_{name}", middle, 0.5) for name in BALL), (heel, middle, -1.0)]
+        foot: list[Term] = [*((f"{side}_{name}", middle, 0.5) for name in BALL), (f"{side}_{HEEL}", middle, -1.0)]
         axis, outward = ground.sum_of(foot), right if side == "r" else -right
         turned, error = np.arctan2(axis @ outward, axis @ facing), ground.turn_std_of(foot, outward, axis)
         out["foot progression [deg]"] = float(np.degrees(turned)), float(np.degrees(error))
@@ -179,8 +177,8 @@ class _Ground:
         return int(np.argmin(np.abs(self._motion.times - time)))
 
     def heel(self, side: str) -> str:
-        """The landmark of a side's heel by which lengths are measured."""
-        names = (f"{side[0]}_{name}" for name in (_BACK, HEEL))
+        """The back of a side's heel, where laboratories measure steps, or the sole where the body has no such mark."""
+        names = (f"{side[0]}_{name}" for name in ("calcaneus_posterior", HEEL))
         return next(name for name in names if name in self._motion.body.landmarks.names)
 
     def sum_of(self, terms: Sequence[Term]) -> NDArray:
@@ -250,8 +248,8 @@ class _Ground:
     def turn_std_of(self, foot: Sequence[Term], across: NDArray, axis: NDArray) -> float:
         """[rad] standard deviation of the direction of a line `axis` (2,) [m] on a foot, in one frame."""
         world = self._R.T @ np.array([across[0], 0.0, across[1]])
-        slope = np.sum([weight * self._slopes(self._points(name), frame, world) for name, frame, weight in foot], axis=0)
-        slope = slope / np.linalg.norm(axis)
+        slopes = [weight * self._slopes(self._points(name), frame, world) for name, frame, weight in foot]
+        slope = np.sum(slopes, axis=0) / np.linalg.norm(axis)
         used = np.flatnonzero(np.abs(slope) > 1e-9)
         return self._motion.std_of(np.full(len(used), foot[0][1]), used, slope[used])
 
