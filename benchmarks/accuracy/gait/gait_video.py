@@ -84,10 +84,10 @@ def of_person(measured: Motion, random: np.random.Generator) -> Motion:
 def by_cameras(truth: Motion, draw: int, random: np.random.Generator) -> Motion:
     """A walk as four cameras measure it."""
     rig = studio_rig(truth, size=SIZE)
-    told = Rig(tuple(camera.with_pose(camera_error(random) @ camera.T_camera_world) for camera in rig))
+    calibrated = Rig(tuple(camera.with_pose(camera_error(random) @ camera.T_camera_world) for camera in rig))
     text = f'[take]\nrate = {RATE}\nup = "y"\n[calibration]\nfile = "calibration.toml"\n'
     with tempfile.TemporaryDirectory() as folder:
-        write_calibration(told, Path(folder) / "calibration.toml")
+        write_calibration(calibrated, Path(folder) / "calibration.toml")
         for name, points in zip(rig.names, detected(truth, rig, draw, cameras=rig.names)):
             np.save(Path(folder) / f"{name}.npy", points)
             text += f'[[camera]]\nname = "{name}"\n[[keypoints]]\ncamera = "{name}"\nformat = "mediapipe"\n'
