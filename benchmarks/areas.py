@@ -128,6 +128,7 @@ AREAS: dict[str, dict[str, str]] = {
     },
     "gait": {
         "gait_events": "contacts, toe-offs and steps of laboratory files, against plates and their own events",
+        "gait_video": "steps, strides and events of real walks from four simulated cameras, and from markers",
         "gait_record": "records of laboratory files by the command",
         "gait_movements": "jumps against force plates; squats and rises from a seat counted",
         "gait_mass": "centre of mass of laboratory files, against the double integral of plates' forces",

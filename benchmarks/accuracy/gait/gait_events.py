@@ -50,7 +50,8 @@ class Event:
 def run() -> None:
     """Print the figures of the walks that were kept back, and of all how many have a record."""
     off: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    steps, records, plated = list[float](), list[bool](), list[bool]()
+    steps, records, plated = list[tuple[float, float]](), list[bool](), list[bool]()
+    own: dict[str, list[tuple[float, float]]] = {"contact": [], "off": []}
     for name in (*PRINTED, *CHOSEN)[: amount(None, 1)]:
         path = file_of(name)
         if path is None:
@@ -61,25 +62,32 @@ def run() -> None:
         records.append(cycles is not None and cycles.kind == "gait")
         if name in CHOSEN:
             continue
-        for source, events in (("files", _own(markers)), ("plates", _plates(path, markers))):
+        on_plates = plate_events(path, markers)
+        for source, events in (("files", _own(markers)), ("plates", on_plates)):
             for event in events:
-                off.setdefault((source, event.kind), []).append(_missed(motion, event))
+                off.setdefault((source, event.kind), []).append(missed(motion, event))
+        for event in _own(markers):
+            own[event.kind].append((_after_plate(event, on_plates), missed(motion, event)[0]))
         steps += _steps(motion, markers)
         found = [(step.side[0], time) for step in footfalls(measured) for time in (step.contact, step.off)]
         plated += [
             any(side == event.foot and abs(time - event.time) < _SAME_S for side, time in found)
-            for event in _plates(path, markers)
+            for event in on_plates
         ]  # fmt: skip
+    for kind, pairs in own.items():
+        _print_laboratories(kind, 1e3 * np.array(pairs).reshape(-1, 2))
     for source in ("plates", "files"):
         for kind in ("contact", "off"):
-            _print(f"gait_{kind}_{source}", np.array(off.get((source, kind), [])).reshape(-1, 2))
+            print_events(f"gait_{kind}_{source}", np.array(off.get((source, kind), [])).reshape(-1, 2))
     reason = "" if steps else "no recording"
-    figure("gait_step_mm", float(np.sqrt(np.mean(np.square(steps)))) if steps else None, "mm RMS", "<= 5", reason)
+    error, std = 1e3 * np.array(steps).reshape(-1, 2).T
+    figure("gait_step_mm", float(np.sqrt(np.mean(np.square(error)))) if steps else None, "mm RMS", "<= 5", reason)
+    print_held("gait_step", error, std, reason)
     figure("gait_plates_found", 100.0 * float(np.mean(plated)) if plated else None, "% of events", ">= 90", reason)
     figure("gait_records", 100.0 * float(np.mean(records)) if records else None, "% of files", ">= 100", reason)
 
 
-def _print(name: str, found: NDArray) -> None:
+def print_events(name: str, found: NDArray) -> None:
     """Mean and standard deviation of errors, and how many are within two of their own (N, 2) [s]."""
     known = found[np.isfinite(found[:, 0])]
     print(f"# {name}: {len(known)} of {len(found)} events found")
@@ -89,6 +97,29 @@ def _print(name: str, found: NDArray) -> None:
     figure(f"{name}_sd", float(error.std()) if len(known) else None, "ms", "<= 12", reason)
     held = 100.0 * float(np.mean(np.abs(error) <= 2.0 * std)) if len(known) else None
     figure(f"{name}_held", held, "% within 2 sigma", ">= 90", reason)
+
+
+def print_held(name: str, error: NDArray, std: NDArray, reason: str) -> None:
+    """Share of errors (n,) within two of their standard deviations (n,): at least, and at most."""
+    share = 100.0 * float(np.mean(np.abs(error) <= 2.0 * std)) if len(error) else None
+    figure(f"{name}_held_least", share, "% within 2 sigma", ">= 90", reason)
+    figure(f"{name}_held_most", share, "% within 2 sigma", "<= 98", reason)
+
+
+def _after_plate(event: Event, on_plates: list[Event]) -> float:
+    """[s] how much later an event is than the same one of a plate; NaN where there is none."""
+    apart = (event.time - one.time for one in on_plates if (one.foot, one.kind) == (event.foot, event.kind))
+    return next((time for time in apart if abs(time) < _NEAR_S), np.nan)
+
+
+def _print_laboratories(kind: str, pairs: NDArray) -> None:
+    """The files' own events against plates, and ours against them with a plate and without: pairs (N, 2) [ms]."""
+    plated = np.isfinite(pairs[:, 0])
+    groups = {"files after plates": pairs[plated, 0], "ours after files, on plates": pairs[plated, 1],
+              "ours after files, elsewhere": pairs[~plated, 1]}  # fmt: skip
+    for name, found in groups.items():
+        if len(found):
+            print(f"# {kind}, {name}: mean {found.mean():.1f} ms, sd {found.std():.1f} ms, {len(found)} events")
 
 
 def file_of(name: str) -> Path | None:
@@ -120,7 +151,7 @@ def _own(markers: Markers) -> list[Event]:
     ]  # fmt: skip
 
 
-def _plates(path: Path, markers: Markers) -> list[Event]:
+def plate_events(path: Path, markers: Markers) -> list[Event]:
     """Events by force plates under one foot."""
     out = []
     for times, forces, centre in plates_of(path):
@@ -170,7 +201,7 @@ def _index(markers: Markers, label: str) -> int:
     return next(i for i, name in enumerate(markers.names) if name.rpartition(":")[2] == label)
 
 
-def _missed(motion: Motion, event: Event) -> tuple[float, float]:
+def missed(motion: Motion, event: Event) -> tuple[float, float]:
     """[s] how much later the motion has an event, with the standard deviation that it says; NaN without one near."""
     feet = foot_events(motion)
     foot = feet and (feet.left if event.foot == "l" else feet.right)
@@ -180,8 +211,8 @@ def _missed(motion: Motion, event: Event) -> tuple[float, float]:
     return (float(times[near] - event.time), float(stds[near])) if found else (np.nan, np.nan)
 
 
-def _steps(motion: Motion, markers: Markers) -> list[float]:
-    """[mm] how much longer every step is than by the heels' markers at the same times."""
+def _steps(motion: Motion, markers: Markers) -> list[tuple[float, float]]:
+    """[m] how much longer every step is than by the heels' markers at the same times, and its standard deviation."""
     cycles = find_cycles(motion)
     if cycles is None or cycles.feet is None:
         return []
@@ -194,7 +225,7 @@ def _steps(motion: Motion, markers: Markers) -> list[float]:
 
     for side, quantity in zip(cycles.sides, lengths, strict=True):
         opposite = "right" if side.name == "left" else "left"
-        for (start, stop), length in zip(side.times, quantity.values, strict=True):
+        for (start, stop), length, std in zip(side.times, quantity.values, quantity.stds, strict=True):
             landed = feet[opposite].contacts
             landed = landed[(landed > start) & (landed < stop)]
             if len(landed) == 1:
@@ -202,5 +233,5 @@ def _steps(motion: Motion, markers: Markers) -> list[float]:
                 begin, end = (heel(side.name, time + later) for time in (start, stop))
                 middle = heel(opposite, landed[0] + later)
                 along = (end - begin) / np.linalg.norm(end - begin)
-                out.append(1e3 * (length - float((end - middle) @ along)))
-    return [value for value in out if np.isfinite(value)]
+                out.append((length - float((end - middle) @ along), std))
+    return [pair for pair in out if np.isfinite(pair[0])]

@@ -102,7 +102,7 @@ def test_slopes_of_landmarks_are_their_differences(recorded):
     ground, frame, step = _Ground(recorded, np.zeros(2)), 40, 1e-6
     direction, state = np.array([0.6, 0.0, 0.8]), recorded.state(frame)
     point = recorded.body.landmarks.select(("r_heel",))
-    slopes = ground._slopes("r_heel", frame, direction)
+    slopes = ground._slopes(point, frame, direction)
     found = np.zeros(len(slopes))
     for d in range(len(slopes)):
         moves = np.zeros(len(slopes))

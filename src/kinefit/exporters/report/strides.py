@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import PointSet
+from kinefit.bodies.lasting_errors import LastingErrors
 from kinefit.bodies.motion import BRIEF_S, Motion, rotation_between_up
 from kinefit.exporters.report.feet import BALL, HEEL, Feet, FootEvents
 
@@ -116,7 +117,7 @@ def step_quantities(motion: Motion, feet: Feet, side: str, start: float, stop: f
     way = ground.sum_of([(f"{s}_hip", at, sign * 0.5) for s in "lr" for at, sign in ((end, 1.0), (begin, -1.0))])
     if float(np.linalg.norm(way)) > 0.5 * _LEAST_SHARE * (motion.body.stature or 1.7):
         along = way / np.linalg.norm(way)
-        step: list[Term] = [(f"{side[0]}_{HEEL}", end, 1.0), (f"{other.side[0]}_{HEEL}", begin, -1.0)]
+        step: list[Term] = [(ground.heel(side), end, 1.0), (ground.heel(other.side), begin, -1.0)]
         out["step length [m]"] = float(ground.sum_of(step) @ along), ground.std_of(step, along)
     return out
 
@@ -138,7 +139,7 @@ def _lengths(
     """Of a stride of foot "l" or "r", in which the other one lands and this one leaves the ground at times [s]."""
     ground, settled = _Ground(motion, feet.belt), _SETTLED * (stop - start)
     begin, end = (ground.frame(t + settled) for t in (start, stop))
-    heel, opposite = f"{side}_{HEEL}", f"{'r' if side == 'l' else 'l'}_{HEEL}"
+    heel, opposite = ground.heel(side), ground.heel("r" if side == "l" else "l")
     stride: list[Term] = [(heel, end, 1.0), (heel, begin, -1.0)]
     moved = ground.sum_of(stride)
     length = float(np.linalg.norm(moved))
@@ -159,7 +160,7 @@ def _lengths(
         out["step width [m]"] = float(ground.sum_of(beside) @ outward), ground.std_of(beside, outward)
     if off is not None:
         middle = ground.frame(0.5 * (start + off))
-        foot: list[Term] = [*((f"{side}_{name}", middle, 0.5) for name in BALL), (heel, middle, -1.0)]
+        foot: list[Term] = [*((f"{side}_{name}", middle, 0.5) for name in BALL), (f"{side}_{HEEL}", middle, -1.0)]
         axis, outward = ground.sum_of(foot), right if side == "r" else -right
         turned, error = np.arctan2(axis @ outward, axis @ facing), ground.turn_std_of(foot, outward, axis)
         out["foot progression [deg]"] = float(np.degrees(turned)), float(np.degrees(error))
@@ -175,6 +176,11 @@ class _Ground:
     def frame(self, time: float) -> int:
         return int(np.argmin(np.abs(self._motion.times - time)))
 
+    def heel(self, side: str) -> str:
+        """The back of a side's heel, where laboratories measure steps, or the sole where the body has no such mark."""
+        names = (f"{side[0]}_{name}" for name in ("calcaneus_posterior", HEEL))
+        return next(name for name in names if name in self._motion.body.landmarks.names)
+
     def sum_of(self, terms: Sequence[Term]) -> NDArray:
         """(2,) [m] weighted sum of landmarks in some frames."""
         out = np.zeros(2)
@@ -186,44 +192,72 @@ class _Ground:
     def std_of(self, terms: Sequence[Term], direction: NDArray) -> float:
         """[m] standard deviation of that sum along a direction (2,).
 
-        Of a place in one frame it is that of the segment's joint; what frames and feet have in common follows from
-        `LastingErrors`, and the rest of one foot by how far its frames are apart, as in `Motion.std_of`.
+        What frames and feet have in common follows from `LastingErrors`. The rest is that of the segment's joint, of
+        one foot by how far its frames are apart, as in `Motion.std_of`.
         """
-        motion, count = self._motion, len(terms)
+        motion, points = self._motion, [self._points(name) for name, _, _ in terms]
         world = self._R.T @ np.array([direction[0], 0.0, direction[1]])
-        owners = np.array([self._points(name).segments[0] for name, _, _ in terms])
+        owners = np.array([one.segments[0] for one in points])
         frames, weights = np.array([term[1] for term in terms]), np.array([term[2] for term in terms])
         stds = motion.joint_std[frames, owners]
         if not np.isfinite(stds).all():
             return np.inf
-        own = np.square(stds) @ np.square(world)
+        brief = np.square(stds) @ np.square(world)
         apart = np.abs(motion.times[frames][:, None] - motion.times[frames])
-        together, brief = np.zeros((count, count)), own
+        together = np.zeros((len(terms), len(terms)))
         if motion.lasting is not None:
-            dofs = np.arange(motion.body.tree.n_dofs)
-            slopes = [self._slopes(name, frame, world) for name, frame, _ in terms]
-            factors = [motion.lasting.at(np.full(len(dofs), frame), dofs) for frame in frames]
-            constant, drift = (np.array([a @ f[k] for a, f in zip(slopes, factors, strict=True)]) for k in (0, 1))
+            constant, drift = self._factors(motion.lasting, points, frames, world)
             together = constant @ constant.T
             together += np.exp(-apart / max(motion.lasting.drift_time, 1e-9)) * (drift @ drift.T)
-            brief = np.maximum(own - np.diag(together), 0.0)
+            joints = [replace(one, points=np.zeros((1, 3))) for one in points]
+            lasting = np.concatenate(self._factors(motion.lasting, joints, frames, world), axis=1)
+            brief = np.maximum(brief - np.square(lasting).sum(axis=1), 0.0)
         alike = (owners[:, None] == owners) * np.exp(-apart / BRIEF_S)
         together += alike * np.sqrt(np.outer(brief, brief))
         return float(np.sqrt(max(weights @ together @ weights, 0.0)))
 
+    def _factors(
+        self, lasting: LastingErrors, points: Sequence[PointSet], frames: NDArray, world: NDArray
+    ) -> tuple[NDArray, NDArray]:
+        """(n, k), (n, m) [m] constant and drifting errors of n points, each in a frame, along a direction (3,).
+
+        An error of a length moves a point by itself, and by the pose that was fitted with it: the one makes up for most
+        of the other.
+        """
+        known, groups = lasting.parameters, self._motion.body.scale_groups
+        lengths = np.zeros((lasting.constant.shape[2], len(groups)))
+        for g, name in enumerate(f"length {group}" for group in groups):
+            if known is not None and name in known.names:
+                lengths[:, g] = known.directions[:, known.names.index(name)]
+        dofs, out = np.arange(self._motion.body.tree.n_dofs), []
+        for point, frame in zip(points, frames, strict=True):
+            slopes, (constant, drift) = self._slopes(point, frame, world), lasting.at(np.full(len(dofs), frame), dofs)
+            out.append((slopes @ constant + lengths @ self._stretch(point, frame, world), slopes @ drift))
+        return np.array([one for one, _ in out]), np.array([one for _, one in out])
+
+    def _stretch(self, point: PointSet, frame: int, world: NDArray) -> NDArray:
+        """(G,) [m] of a point's way along a direction (3,) by the logarithm of each scale group's length."""
+        motion, body, segment = self._motion, self._motion.body, int(point.segments[0])
+        Ts = body.tree.segment_poses(motion.Ts_world_root[[frame]], motion.angles[[frame]])[0]
+        out, end = np.zeros(len(body.scale_groups)), body.positions(motion.state(frame), point)[0]
+        while segment >= 0:
+            out[body.segment_scale[segment]] += world @ (end - Ts[segment, :3, 3])
+            segment, end = int(body.tree.parents[segment]), Ts[segment, :3, 3]
+        return out
+
     def turn_std_of(self, foot: Sequence[Term], across: NDArray, axis: NDArray) -> float:
         """[rad] standard deviation of the direction of a line `axis` (2,) [m] on a foot, in one frame."""
         world = self._R.T @ np.array([across[0], 0.0, across[1]])
-        slope = np.sum([weight * self._slopes(name, frame, world) for name, frame, weight in foot], axis=0)
-        slope = slope / np.linalg.norm(axis)
+        slopes = [weight * self._slopes(self._points(name), frame, world) for name, frame, weight in foot]
+        slope = np.sum(slopes, axis=0) / np.linalg.norm(axis)
         used = np.flatnonzero(np.abs(slope) > 1e-9)
         return self._motion.std_of(np.full(len(used), foot[0][1]), used, slope[used])
 
-    def _slopes(self, name: str, frame: int, world: NDArray) -> NDArray:
-        """(6 + D,) [m] of a landmark's way along a direction (3,) by each degree of freedom."""
-        tree, state, points = self._motion.body.tree, self._motion.state(frame), self._points(name)
-        lever = self._motion.body.positions(state, points)[0] - state.T_world_root[:3, 3]
-        J = tree.segment_jacobian(tree.forward(state.T_world_root, state.angles)[1], int(points.segments[0]))
+    def _slopes(self, point: PointSet, frame: int, world: NDArray) -> NDArray:
+        """(6 + D,) [m] of a point's way along a direction (3,) by each degree of freedom."""
+        tree, state = self._motion.body.tree, self._motion.state(frame)
+        lever = self._motion.body.positions(state, point)[0] - state.T_world_root[:3, 3]
+        J = tree.segment_jacobian(tree.forward(state.T_world_root, state.angles)[1], int(point.segments[0]))
         return np.asarray(world @ J[:3] + np.cross(lever, world) @ J[3:])
 
     def _points(self, name: str) -> PointSet:
