@@ -50,7 +50,7 @@ def person(body: Body, lengths: NDArray, girths: NDArray) -> Body:
 
 
 def tracked(somebody: Body, count: int, states: list[BodyState], body: Body | None) -> Motion:
-    """The motion by silhouettes of so many views: of this body, fitted to the person, or of the person's own (None)."""
+    """The motion by silhouettes of so many views: of this body, fitted to the person, or of the person's own."""
     with tempfile.TemporaryDirectory() as work:
         save_body(somebody, Path(work) / "person.npz")
         head = 'body = "person.npz"\nsize = false' if body is None else f'body = "{body.name}"'
@@ -58,7 +58,7 @@ def tracked(somebody: Body, count: int, states: list[BodyState], body: Body | No
 
 
 def held_out(body: Body, own: list[int]) -> None:
-    """Print the share of angles within two stated standard deviations, of people and motions that nothing was set by."""
+    """Print the share of angles within two stated standard deviations, of other people and motions."""
     ratios, errors, stated = [], [], []
     for seed, count in ((3, 4), (4, 6)):
         random, groups = np.random.default_rng(seed), len(body.scale_groups)
@@ -71,7 +71,7 @@ def held_out(body: Body, own: list[int]) -> None:
     inside = np.concatenate(ratios) <= 2.0
     off, std = (np.degrees(np.concatenate(values)) for values in (errors, stated))
     print(f"#   held out: all angles {np.sqrt(np.square(off).mean()):.1f} deg RMS off, {np.median(std):.1f} stated; "
-          f"collar bones {np.sqrt(np.square(off[:, own]).mean()):.1f} and {np.median(std[:, own]):.1f}", flush=True)  # fmt: skip
+          f"collar bones {np.sqrt(np.square(off[:, own]).mean()):.1f} and {np.median(std[:, own]):.1f}")  # fmt: skip
     figure("collar_bones_held", 100.0 * float(inside[:, own].mean()), "% within two standard deviations", ">= 90")
     figure("collar_bones_all_held", 100.0 * float(inside.mean()), "% of all angles within two", ">= 90")
 

@@ -8,8 +8,8 @@ Let the segment's surface be shifted and turned by an unknown e ~ N(0, Σ). Elim
     H' = H − H (H + Σ⁻¹)⁻¹ H,        g' = Σ⁻¹ (H + Σ⁻¹)⁻¹ g
 
 Points of a skin that blends or morphs do not move with their segment alone: their derivatives J by the pose are no
-function of the segment's twist. Those by the offset are, A = (n, x × n): the root's columns of J, as a turn of the whole
-body turns every point. With whitened rows and A in standard deviations of e, eliminating e whitens once more, by
+function of the segment's twist. Those by the offset are, A = (n, x × n). These are the root's columns of J, since a turn
+of the whole body turns every point. With whitened rows, and A by standard deviations of e, eliminating e whitens again:
 
     W' = I − A (AᵀA + I)⁻¹ Aᵀ = (I − U (1 − (1 + S²)^-½) Uᵀ)²,        A = U S Vᵀ
 """
@@ -116,19 +116,19 @@ class BlendedSkin:
 
     @cached_property
     def _eliminated(self) -> BlendedSkin:
-        out = [np.array(values) for values in (self.J, self.residual, self.offset)]
+        J, residual, offset = (np.array(values) for values in (self.J, self.residual, self.offset))
         for s in np.unique(self.segment):
             own = self.segment == s
             U, scale, _ = np.linalg.svd(self.offset[own, :6], full_matrices=False)
             U_less = U * (1.0 - 1.0 / np.sqrt(1.0 + scale**2))
-            for values in out:
+            for values in (J, residual, offset):
                 values[own] -= U_less @ (U.T @ values[own])
-        return BlendedSkin(*out, self.segment)
+        return BlendedSkin(J, residual, offset, self.segment)
 
     def rows(self) -> DofRows:
         """The rows with surface offsets eliminated, as n rows at most."""
         found, n = self._eliminated, self.J.shape[1]
-        R = np.linalg.qr(np.column_stack([found.J, found.residual]), mode="r")[:n]
+        R = np.asarray(np.linalg.qr(np.column_stack([found.J, found.residual]), mode="r"))[:n]
         return DofRows(R[:, :n], R[:, n], np.ones(len(R)), np.full(len(R), -1))
 
     @property
@@ -177,10 +177,11 @@ def skin_of(
     for s, by in (pair for m in matched for pair in m.turns.items()):
         if by @ by > turned[s] @ turned[s]:
             turned[s, 3:] = R[s] @ by
-    if any(isinstance(part, DofRows) for part in parts):
+    plain = [part for part in parts if isinstance(part, Rows)]
+    if len(plain) < len(parts):
         dense = [on_moved_joints(scene.pose, part) if isinstance(part, Rows) else part for part in parts]
         return _blended(scene, dense, middle, sigma, turned)
-    rows = Rows.concat(*parts)
+    rows = Rows.concat(*plain)
     factor = np.concatenate([np.zeros(0), *(robust_factors(p)[0] for p in parts)])
     data = np.array(rows.data)
     data[:3] -= middle[rows.segment].T
@@ -201,9 +202,7 @@ def skin_of(
     return Skin(0.5 * (reduced + reduced.swapaxes(1, 2)), g[..., 0], _jacobians(scene, middle), sigma, H, turned)
 
 
-def _blended(
-    scene: Scene, parts: Sequence[DofRows], middle: NDArray, sigma: NDArray, turned: NDArray
-) -> BlendedSkin:
+def _blended(scene: Scene, parts: Sequence[DofRows], middle: NDArray, sigma: NDArray, turned: NDArray) -> BlendedSkin:
     """Whitened rows with their surface offsets about the segments' middles (S, 3) [m] in the world."""
     root = np.sqrt(np.concatenate([p.weight * robust_factors(p)[0] for p in parts]))
     J = root[:, None] * np.concatenate([p.jacobian for p in parts])

@@ -231,7 +231,8 @@ def _of_rows(
     residuals, pushes = ChannelResiduals(), Spool[list[tuple[str, _Push]]]()
     variance, independent = defaultdict[str, list[NDArray]](list), set[str]()
     for f in range(len(take.roots)):
-        scene, surface, pushed = others.scene(f, take.roots, take.angles), list[Rows | DofRows](), list[tuple[str, _Push]]()
+        scene, surface = others.scene(f, take.roots, take.angles), list[Rows | DofRows]()
+        pushed = list[tuple[str, _Push]]()
         for m in matched[f]:
             scale = others.scale.get(m.sensor, 1.0)
             made = [r for r in rows_at(m, scene) if r.weight.ndim == 1 and len(r)]
