@@ -8,7 +8,7 @@ Let the segment's surface be shifted and turned by an unknown e ~ N(0, Σ). Elim
     H' = H − H (H + Σ⁻¹)⁻¹ H,        g' = Σ⁻¹ (H + Σ⁻¹)⁻¹ g
 
 Points of a skin that blends or morphs do not move with their segment alone: their derivatives J by the pose are no
-function of the segment's twist. Those by the offset are, A = (n, x × n). These are the root's columns of J, since a turn
+function of the segment's twist. Those by the offset are, A = (n, x × n). They are the root's columns of J: a turn
 of the whole body turns every point. With whitened rows, and A by standard deviations of e, eliminating e whitens again:
 
     W' = I − A (AᵀA + I)⁻¹ Aᵀ = (I − U (1 − (1 + S²)^-½) Uᵀ)²,        A = U S Vᵀ
