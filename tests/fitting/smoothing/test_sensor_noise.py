@@ -21,7 +21,7 @@ from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import squat_and_wave
 from kinefit.solving.equations import block_diagonal, design, normal_equations
-from kinefit.solving.rows import PairRows, ParameterRows, Rows
+from kinefit.solving.rows import DofRows, PairRows, ParameterRows, Rows
 
 HALF = 3
 
@@ -91,12 +91,12 @@ def test_information_and_lasting_errors_are_sums_over_rows_and_frames(tracked, p
 
 
 class Surface(Matched):
-    """Points of two segments' surfaces, each 5 mm off along its normal."""
+    """Points of two segments' surfaces, each 5 mm off along its normal; the first of them as rows of a skin."""
 
     sensor, of_points, error = "surface", False, 0.0
 
-    def __init__(self, body, state, seed):
-        random = np.random.default_rng(seed)
+    def __init__(self, body, state, seed, blended):
+        random, self.blended = np.random.default_rng(seed), blended
         self.segment = np.repeat([body.tree.segment("thigh_r"), body.tree.segment("shank_r")], 40)
         centre = body.tree.segment_poses(state.T_world_root[None], state.angles[None])[0, self.segment, :3, 3]
         self.point = centre + random.normal(0.0, 0.1, (80, 3))
@@ -104,15 +104,23 @@ class Surface(Matched):
         self.normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def rows(self, scene):
-        return [Rows.of(self.segment, self.point, self.normal, 0.005 + self.error, 1.0 / 0.01**2)]
+        error = np.broadcast_to(0.005 + self.error, 80)
+        skin, plain = (
+            Rows.of(self.segment[some], self.point[some], self.normal[some], error[some], 1.0 / 0.01**2)
+            for some in (slice(self.blended), slice(self.blended, None))
+        )
+        J = design(scene.body, scene.state, skin)
+        dense = DofRows(J, skin.residual, skin.weight, skin.group, segment=skin.segment)
+        return [rows for rows in (dense, plain) if len(rows)]
 
 
+@pytest.mark.parametrize("blended", [0, 30, 80])
 @pytest.mark.parametrize("points", [0, 100])
-def test_surfaces_move_the_pose_as_refitting_does(tracked, points):
+def test_surfaces_move_the_pose_as_refitting_does(tracked, points, blended):
     body, _, take, _ = tracked
     T, n, settings = len(take.roots), body.tree.n_dofs, TrackSettings()
     others = replace(take.others, points=np.full(T, points), scale={})
-    matched = [(Surface(body, others.scene(f, take.roots, take.angles).state, f),) for f in range(T)]
+    matched = [(Surface(body, others.scene(f, take.roots, take.angles).state, f, blended),) for f in range(T)]
     found = sensor_noise.noise_of_sensors(replace(take, others=others), matched, half=0)
     scene, (surface,) = others.scene(5, take.roots, take.angles), matched[5]
     information, lasting = found.pooled(5), found.pushes(5).rest

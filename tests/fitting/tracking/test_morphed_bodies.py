@@ -94,6 +94,19 @@ def test_arms_are_followed_with_their_shoulders(body, rig, sensors):
     assert ends["stiff"] > 2 * ends["morphing"]
 
 
+def test_error_bars_have_the_error_of_each_surface(body, rig):
+    """By silhouettes alone a body that morphs is about as uncertain as the same one held stiff."""
+    bars, start = [], posture(body, 0)
+    for own in (body, replace(body, morphs=())):
+        follow = Tracker(own, rig, rate=30.0, settings=TrackSettings(search=False), up="y")
+        follow.start_at(start)
+        result = follow.update(silhouettes(Morphing(own), start, rig, 0.0))
+        bars.append(result.dof_std[6:][[own.tree.coordinate(name) for name in JOINTS]])
+    assert (np.degrees(bars) > 2.0).all()
+    ratio = bars[0] / bars[1]
+    assert (ratio > 0.4).all() and (ratio < 2.5).all(), ratio
+
+
 def keypoint_sensor(rig):
     return KeypointSensor(rig, {}, 3.0, geman_mcclure(), 0.03)
 

@@ -12,7 +12,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.fitting.frame.minimum import ROUGH_ITERATIONS, ROUGH_TOLERANCE, Minimum, minimum
 from kinefit.fitting.frame.prediction import prediction_row, release_dofs
 from kinefit.fitting.frame.results import ROOT_PRIOR_STD, FrameResult, evidence_of, frame_result, sum_evidence
-from kinefit.fitting.frame.skin import skin_of
+from kinefit.fitting.frame.skin import has_surface_offset, skin_of
 from kinefit.fitting.frame.trust import (
     angles_off_prediction,
     dofs_moving,
@@ -32,7 +32,7 @@ from kinefit.solving.correspondences.occupancy.collisions import CollisionPairs,
 from kinefit.solving.correspondences.points import prior_rows
 from kinefit.solving.equations import inverse, joint_moves, normal_equations
 from kinefit.solving.least_squares import gauss_newton
-from kinefit.solving.rows import AnyRows, Rows, weaker
+from kinefit.solving.rows import AnyRows, DofRows, Rows, weaker
 
 _PRIOR_REMAINDER = 1e-6  # share of the prior that stays, so that an unobserved coordinate has a finite variance
 _MAX_MATCH_ROUNDS = 3  # of matching and solving, where only discrete parts of a match change
@@ -302,15 +302,15 @@ def ignores_surface_offsets(scene: Scene, settings: TrackSettings, points: int) 
 
 def _kinds(
     scene: Scene, matched: Sequence[Matched], scale: Mapping[str, float] | None, points: int, without: Without
-) -> tuple[list[AnyRows], list[Rows], int]:
+) -> tuple[list[AnyRows], list[Rows | DofRows], int]:
     """Rows of everything but surfaces, rows of surfaces, and the number of rows of points."""
     parts: list[AnyRows] = []
-    surface: list[Rows] = []
+    surface: list[Rows | DofRows] = []
     for m, off in zip(matched, without or [None] * len(matched)):
         for rows in rows_at(m, scene):
             rows = weaker(rows, (scale or {}).get(m.sensor, 1.0))
             rows = rows if off is None else without_segments(rows, off)
-            if not m.of_points and isinstance(rows, Rows):
+            if has_surface_offset(rows, m):
                 surface.append(rows)
             else:
                 parts.append(rows)

@@ -15,7 +15,7 @@ from kinefit._mapped import room
 from kinefit.bodies import Body, BodyState
 from kinefit.fitting.frame.fit import ignores_surface_offsets, rows_of_points
 from kinefit.fitting.frame.results import ROOT_PRIOR_STD
-from kinefit.fitting.frame.skin import skin_of
+from kinefit.fitting.frame.skin import has_surface_offset, skin_of
 from kinefit.fitting.smoothing.process_noise import SmoothTake
 from kinefit.fitting.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.fitting.smoothing.tracked_frames import TrackedFrames
@@ -33,7 +33,7 @@ from kinefit.solving.equations import (
     product,
     robust_factors,
 )
-from kinefit.solving.rows import Rows, weaker
+from kinefit.solving.rows import DofRows, Rows, weaker
 from kinefit.solving.trajectory.variance_components import VarianceComponents, variance_components
 
 _RIGID_SURFACE_STDS = 1e-6, 1e-6  # [m], [rad] of surface offsets of a body without joints: it is its surface
@@ -231,12 +231,13 @@ def _of_rows(
     residuals, pushes = ChannelResiduals(), Spool[list[tuple[str, _Push]]]()
     variance, independent = defaultdict[str, list[NDArray]](list), set[str]()
     for f in range(len(take.roots)):
-        scene, surface, pushed = others.scene(f, take.roots, take.angles), list[Rows](), list[tuple[str, _Push]]()
+        scene, surface = others.scene(f, take.roots, take.angles), list[Rows | DofRows]()
+        pushed = list[tuple[str, _Push]]()
         for m in matched[f]:
             scale = others.scale.get(m.sensor, 1.0)
             made = [r for r in rows_at(m, scene) if r.weight.ndim == 1 and len(r)]
-            points = [r for r in made if m.of_points or not isinstance(r, Rows)]
-            surface += [weaker(r, scale) for r in made if isinstance(r, Rows) and not m.of_points]
+            points = [r for r in made if not has_surface_offset(r, m)]
+            surface += [weaker(r, scale) for r in made if has_surface_offset(r, m)]
             weights = [r.weight * robust_factors(r)[0] / scale**2 for r in points]
             for rows, w, at in zip(points, weights, residuals.add(f, m, points, [r.residual for r in points], weights)):
                 used = w > 0.0

@@ -33,6 +33,7 @@ COARSE_ITERATIONS = 4, MAX_POSE_STEPS
 
 _FINE_ITERATIONS = 15  # of the solver, in the last rounds
 _MAX_CHANGE_SIGMAS = 0.01  # posterior standard deviations of a change between rounds that counts as converged
+_MAX_REMATCH_SIGMAS = 2.0  # the same of nearest points: new pairs alone move all parameters together by 1.3 to 1.9
 
 
 @checked
@@ -110,7 +111,8 @@ def fit_subject(
         )  # fmt: skip
         theta, states, moved = solved.theta, solved.states, solved.theta - before
         squared_change = moved @ (prior.information + solved.information) @ moved
-        if not early and solved.converged and squared_change < _MAX_CHANGE_SIGMAS**2:
+        converged = used >= len(reach) if rematched else not early and solved.converged
+        if converged and squared_change < (_MAX_REMATCH_SIGMAS if rematched else _MAX_CHANGE_SIGMAS) ** 2:
             break
     if looks is None:
         excess_of = excess(frames.rows_of_frames(theta, states), _effective_parameters(body, solved))

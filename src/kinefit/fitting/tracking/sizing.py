@@ -45,6 +45,7 @@ _POSES = 8  # and how many of them it is found from: twice as many change no hal
 _REFINING_POSES = 20  # of a former motion: they are near the truth, and cost no tracking
 _MARKER_POSES = 16  # of markers alone, whose places are found by how they move; a frame of them costs little
 _MATCHES = 3  # rounds of matching and solving
+_MATCHES_OF_LENGTHS = 20  # of lengths by surfaces alone, at most: after 3, those of a rendered person are 2 cm off
 _PLACES = 2  # fits with a better spread of the markers' places; it changes by less than a tenth from then on
 _TURN_FRAMES, _TURN_POSES = 240, 10  # that decide whether a video camera was rotated, and which
 _MOVES = 3  # times that cameras are moved to where a subject fit has found them
@@ -309,7 +310,10 @@ def _by_all(
     def fit(unknown: Unknowns, seen: Sequence[Sequence[Measurement]], near: Sequence[BodyState]) -> SubjectFit:
         world = unknown.world
         balls = any(isinstance(p, MetaballShape) for p in unknown.parameters)
-        rounds, coarse = ROUNDS if balls else (_MATCHES, joint.COARSE_ITERATIONS)
+        lengths = any(isinstance(p, SegmentScales) for p in unknown.parameters)
+        slow = lengths and not any(m.settled for several in seen for m in several)
+        matches = _MATCHES_OF_LENGTHS if slow else _MATCHES
+        rounds, coarse = ROUNDS if balls else (matches, joint.COARSE_ITERATIONS)
         return joint.fit_subject(
             world.body, world.rig, seen, near, unknown.parameters, start=unknown.start, loss=settings.loss,
             times=times, velocities=velocities, rounds=rounds, coarse=coarse, progress=progress,
