@@ -7,17 +7,11 @@ import ezc3d
 import numpy as np
 import pytest
 
-from kinefit import fit_marker_subject, fit_markers, load_body, read_markers, read_motion, write_motion
+from kinefit import load_body, read_markers, read_motion, write_motion
 from kinefit.exporters import write_c3d, write_forces
 from kinefit.exporters.gait.plates import by_plates, footfalls, plate_findings, standing_mass, stood_on
 from kinefit.exporters.report.feet import foot_events
 from kinefit.readers.plates import read_force_file
-
-
-@pytest.fixture(scope="module")
-def walk(data_dir):
-    markers = read_markers(data_dir("gait_biomechzoo") / "HC030A" / "straight.c3d")
-    return fit_markers(fit_marker_subject(load_body("humanoid"), markers, frames=12), markers, smooth=False)
 
 
 def events_of(motion):
