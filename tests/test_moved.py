@@ -6,10 +6,10 @@ from importlib.util import find_spec
 import pytest
 
 import kinefit
-from kinefit._moved import MOVED, moved
+from kinefit._moved import MOVED_PATHS, moved
 
 
-@pytest.mark.parametrize("old", MOVED)
+@pytest.mark.parametrize("old", MOVED_PATHS)
 def test_every_old_path_leads_to_a_module(old):
     assert find_spec(moved(f"kinefit.{old}"))
 

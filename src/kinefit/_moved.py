@@ -9,7 +9,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-MOVED = {
+MOVED_PATHS = {
     "app": "studio.app", "assets": "readers.assets", "batch": "takes.batch", "batch.viewed": "studio.viewers.viewed",
     "bodies.anny": "bodies.morphs.anny", "bodies.body_surfaces": "bodies.surfaces.places",
     "bodies.joint_names": "bodies.toml.joint_names", "calibration": "rigs",
@@ -36,7 +36,7 @@ def moved(old: str) -> str:
     """Where a module with this dotted name of version 0.2 is now; empty if it is no such name."""
     parts = old.split(".")[1:]
     for count in range(len(parts), 0, -1):
-        if new := MOVED.get(".".join(parts[:count])):
+        if new := MOVED_PATHS.get(".".join(parts[:count])):
             return ".".join(["kinefit", new, *parts[count:]])
     return ""
 

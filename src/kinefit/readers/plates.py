@@ -22,9 +22,9 @@ from kinefit.readers.c3d_file import C3d
 _CHANNELS = {1: 6, 2: 6, 3: 8, 4: 6}  # of each type
 _PER_UNIT = {"": 1.0, "n": 1.0, "nt": 1.0, "nm": 1.0, "nmm": 1e-3, "ntmm": 1e-3, "ncm": 1e-2, "ntm": 1.0, "kn": 1e3}
 _FACTORS = 1e-3, 1e3  # by which a stated unit of moments is wrong, if it is
-_INSIDE, _OUTSIDE = 0.9, 0.5  # share of loaded samples whose centre of pressure lies on a plate: surely, and surely not
+_SHARE_INSIDE, _SHARE_OUTSIDE = 0.9, 0.5  # share of loaded samples whose centre of pressure lies on a plate: surely, and surely not
 _RESTS = 0.1  # of the range of the load, that a plate shows at rest
-_FAR = 50.0  # [m] from a laboratory's origin: millimetres that are read as metres
+_MAX_PLACE = 50.0  # [m] from a laboratory's origin: millimetres that are read as metres
 _MARGIN = 0.05  # [m] beyond a plate's edge: errors of a centre of pressure at light loads
 _MOT_REMEDY = "Give a .mot of OpenSim: a line endheader, then time and ground_force_vx, _vy, _vz, _px, _py, _pz."
 _MIN_SIDE = 0.05  # [m]: corners nearer to each other are none
@@ -125,11 +125,11 @@ def _plate(
     plate = ForcePlate(f"plate {k + 1}", corners, rate, start, *placed(values))
     if not (np.isfinite(plate.force).all() and np.isfinite(plate.moment).all()):
         return None, ["left out: its forces are not finite"]
-    if share_inside(plate) < _OUTSIDE:
+    if share_inside(plate) < _SHARE_OUTSIDE:
         for factor in _FACTORS if kind in (2, 4) else ():
             other = replace(plate, moment=placed(values * np.repeat([1.0, factor], 3))[1])
             moves = np.ptp(np.nan_to_num(other.centre_of_pressure()), axis=0).max() > 1e-3
-            if share_inside(other) > _INSIDE and moves:
+            if share_inside(other) > _SHARE_INSIDE and moves:
                 said = "N mm" if factor > 1 else "N m"
                 text = f"its moments are not in {said}, though the file says so: corrected by {factor:g}"
                 return other, [*notes, text]
@@ -267,7 +267,7 @@ def _of_table(stem: str, columns: dict[str, NDArray], rate: float, path: Path) -
         if not np.isfinite(values).all():
             place = f"row {int(np.argmax(~np.isfinite(values).all(axis=1))) + 1}, {stem}"
             raise FileError(f"a {what} that is no number", file=path, place=place, remedy="Export it without gaps.")
-    if np.abs(at).max() > _FAR:
+    if np.abs(at).max() > _MAX_PLACE:
         problem = f"a centre of pressure {np.abs(at).max():.0f} m from the origin"
         raise FileError(problem, file=path, place=stem, remedy="Give metres: OpenSim's unit.")
     used = at[stood] if stood.any() else np.zeros((1, 3))

@@ -31,13 +31,13 @@ CONTACT_STD_S = 0.003
 
 _MIN_STEP_S, _MIN_PEAK = 0.1, 40.0  # [s], [N]: shorter or lighter, it is no step
 _MAX_OFF = 0.12  # [m] of the centre of pressure from the line between heel and ball: half a foot's width and its toes
-_WHOLE = 0.9  # of the time, and of a foot's points, over a plate
+_WHOLE_SHARE = 0.9  # of the time, and of a foot's points, over a plate
 _NEARER = 0.05  # [m] by which the other foot is farther away, so that it is known whose step it is
 _EDGE = 0.03  # [m] beyond a plate's edge: the skin and errors of landmarks
 _MOVING = 0.5  # [m/s] of a foot that swings past the other: it stands on nothing
-_BESIDE, _RIGHT = 0.06, 0.04  # [m] from the foot in the median: surely wrong, and surely right once it is corrected
-_ELSEWHERE = 0.3  # [m]: about a foot's length beside it, somebody or something else stands there
-_BETTER = 0.4  # of the distance before, once it is corrected
+_MIN_OFFSET, _MAX_CORRECTED = 0.06, 0.04  # [m] from the foot in the median: surely wrong, and surely right once it is corrected
+_FOOT_OFFSET = 0.3  # [m]: about a foot's length beside it, somebody or something else stands there
+_CORRECTED_SHARE = 0.4  # of the distance before, once it is corrected
 _SAME_S = 0.12  # [s] between an event of a plate and that of the motion which is the same
 _STRIDE_S = 0.4  # [s] from an event to the next one of its kind and foot, at least: sprinters take 0.45 s
 _LATE_S, _MAX_SPREAD_S = 0.05, 0.03  # [s]: events by the feet's speed are right to 12 ms
@@ -124,9 +124,9 @@ def footfalls(motion: Motion) -> list[Footfall]:
 def _is_whole(side: int, parts: Sequence[_Loaded]) -> bool:
     """Whether every point of a foot is over one of the plates that it loads."""
     if len(parts) == 1:
-        return bool(parts[0].is_over(side).mean() > _WHOLE)
+        return bool(parts[0].is_over(side).mean() > _WHOLE_SHARE)
     over = [one.is_over(side).mean(axis=0) for one in parts]  # of each plate, by point
-    return bool(np.max(over, axis=0).min() > _WHOLE)
+    return bool(np.max(over, axis=0).min() > _WHOLE_SHARE)
 
 
 def _footfall(side: int, parts: Sequence[_Loaded]) -> Footfall:
@@ -286,15 +286,15 @@ def _misplaced(own: list[_Loaded]) -> tuple[str, str]:
     distance = lambda offsets: float(np.median(np.hypot(*np.concatenate(offsets).T)))
     as_said = [nearest(one, one.cop) for one in own]
     before = distance(as_said)
-    if before < _BESIDE:
+    if before < _MIN_OFFSET:
         return "", ""
     shift = np.median(np.concatenate(as_said), axis=0)
     found = {how: distance([nearest(one, one.cop * signs) for one in own]) for how, signs in turns.items()}
     found[f"shifted by {100 * np.hypot(*shift):.0f} cm"] = distance([nearest(one, one.cop - shift) for one in own])
-    good = [how for how, after in found.items() if after < min(_RIGHT, _BETTER * before)]
+    good = [how for how, after in found.items() if after < min(_MAX_CORRECTED, _CORRECTED_SHARE * before)]
     name, far = own[0].plate.name, f"its centre of pressure is {100 * before:.0f} cm from the nearest foot"
     if good:
         return f"{name} is {' or '.join(good)}: {far}.", "Likely: so corrected, each step lies under its foot."
-    if before < _ELSEWHERE:
+    if before < _FOOT_OFFSET:
         return "", ""
     return f"{name} does not lie under the feet: {far}.", "Certain; neither a shift nor a turn explains it."

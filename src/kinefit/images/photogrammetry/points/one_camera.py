@@ -15,7 +15,7 @@ from kinefit.images.photogrammetry.intersection import Intersections
 _FLAT_DISTANCE = 1000.0  # [m] of a camera that faces a plane: its rays are parallel to 2 mrad over 2 m
 BODY_SIGMA = 0.02  # [m] of the body's surface along a ray
 _MAX_MISS = 0.02  # [m] by which a ray may pass the body
-_FARTHEST = 30.0  # [m] of a body from the camera
+_MAX_DISTANCE = 30.0  # [m] of a body from the camera
 _MAX_STEPS = 40  # along a ray, each as long as the distance from the body
 
 Ranges = Callable[[int, NDArray], NDArray]
@@ -45,7 +45,7 @@ def body_ranges(motion: Motion, camera: Camera) -> Ranges:
         ray, along, state = camera.ray(uv), np.zeros(len(uv)), motion.state(frame)
         for _ in range(_MAX_STEPS):
             x = camera.centre_world + along[:, None] * ray
-            gap = nearest(motion.body, state, x, max_distance=_FARTHEST).distance
+            gap = nearest(motion.body, state, x, max_distance=_MAX_DISTANCE).distance
             best, least = np.where(gap < least, along, best), np.minimum(gap, least)
             along = along + np.maximum(gap, 0.0)
         return best
