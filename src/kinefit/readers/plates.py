@@ -22,7 +22,7 @@ from kinefit.readers.c3d_file import C3d
 _CHANNELS = {1: 6, 2: 6, 3: 8, 4: 6}  # of each type
 _PER_UNIT = {"": 1.0, "n": 1.0, "nt": 1.0, "nm": 1.0, "nmm": 1e-3, "ntmm": 1e-3, "ncm": 1e-2, "ntm": 1.0, "kn": 1e3}
 _FACTORS = 1e-3, 1e3  # by which a stated unit of moments is wrong, if it is
-_SHARE_INSIDE, _SHARE_OUTSIDE = 0.9, 0.5  # of loaded samples with their centre of pressure on a plate: surely, surely not
+_SHARE_INSIDE, _SHARE_OUTSIDE = 0.9, 0.5  # of loaded samples with the centre of pressure on the plate: surely; not
 _RESTS = 0.1  # of the range of the load, that a plate shows at rest
 _MAX_PLACE = 50.0  # [m] from a laboratory's origin: millimetres that are read as metres
 _MARGIN = 0.05  # [m] beyond a plate's edge: errors of a centre of pressure at light loads
