@@ -32,8 +32,8 @@ def sides_right(motion: Motion, rig: Rig, people: Sequence[Keypoints]) -> tuple[
     uv, confidence = np.array(channels.uv), np.array(channels.confidence)
     for f, weight in enumerate(channels.weight):
         scene = Scene(motion.body, motion.state(f), channels.rig)
-        beside = layout.beside(scene)
-        fitted[f] = projected(scene, layout) + (0.0 if beside is None else beside)
+        offset = layout.bias(scene)
+        fitted[f] = projected(scene, layout) + (0.0 if offset is None else offset)
         swapped = find_swaps(channels, groups, uv[f], weight, fitted[f])
         order = np.where(swapped, channels.partner, np.arange(len(swapped)))
         uv[f], confidence[f] = uv[f, order], confidence[f, order]
