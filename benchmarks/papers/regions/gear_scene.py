@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
@@ -78,7 +79,7 @@ class GearScene:
     ground: Callable[[NDArray, NDArray], tuple[NDArray, NDArray, NDArray]]
     shutter: float
     seed: int
-    _shadows: dict[float, NDArray] = field(default_factory=dict)
+    _shadows: dict[float, tuple[Any, NDArray]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.light.share)
@@ -126,8 +127,13 @@ class GearScene:
         """(M, M) [m] depth of what moves as the lamp sees it, at a time in frames; kept, as all cameras ask for it."""
         if time not in self._shadows:
             middle = self.moving.posed(0).mean(axis=0)
-            self._shadows[time] = _sun(self.light, middle, self.moving.posed(time), self.moving.mesh.faces)
-        return self._shadows[time]
+            sun = _sun(self.light, middle, self.moving.posed(time), self.moving.mesh.faces)
+            rows, columns = (np.flatnonzero(np.isfinite(sun).any(axis=axis)) for axis in (1, 0))
+            box = tuple(slice(found.min(initial=0), found.max(initial=0) + 1) for found in (rows, columns))
+            self._shadows[time] = box, sun[box].copy()  # 300 whole maps take 14 GB
+        sun = np.full((_MAP, _MAP), np.inf, np.float32)
+        sun[self._shadows[time][0]] = self._shadows[time][1]
+        return sun
 
 
 class _Plate:
