@@ -199,10 +199,10 @@ def _plates(motion: Motion, unit: str, factor: float) -> tuple[dict[str, Value],
     samples = max(round(max(plate.rate for plate in motion.plates) / motion.rate), 1)
     times = motion.times[0] + np.arange(len(motion) * samples) / (motion.rate * samples)
     columns, labels, corners = list[NDArray](), list[str](), list[NDArray]()
-    for k, plate in enumerate(motion.plates, 1):
+    for k, plate in enumerate((plate.at(times) for plate in motion.plates), 1):
         axes = np.vstack([plate.axes, np.cross(*plate.axes)])
         on_plate = np.concatenate([-plate.force @ axes.T, -factor * plate.moment @ axes.T], axis=1)
-        columns += [np.interp(times, plate.times, c, 0.0, 0.0) for c in on_plate.T]
+        columns += list(on_plate.T)
         labels += [f"{kind}{axis}{k}" for kind in ("Force.F", "Moment.M") for axis in "xyz"]
         corners.append(factor * plate.corners.T)
     count, channels = len(motion.plates), len(labels)

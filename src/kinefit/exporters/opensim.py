@@ -244,7 +244,7 @@ def write_mot(motion: Motion, path: str | PathLike[str]) -> None:
 def write_forces(motion: Motion, path: str | PathLike[str]) -> None:
     """Write what force plates measured as ground forces of OpenSim, y up: `ground_force_1_vx` and so on.
 
-    Force [N], centre of pressure [m] and free moment [N m] of each plate, zero where nobody stands on it, at the
+    Force [N], centre of pressure [m] and free moment [N m] of each plate, zero below 20 N, at the
     highest rate of the plates.
 
     Raises

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,14 +46,14 @@ class ForcePlate:
         """(3,) [m] of the corners."""
         return np.asarray(self.corners).mean(axis=0)
 
-    @property
+    @cached_property
     def normal(self) -> NDArray:
-        """(3,) unit vector from the plate to who stands on it: nobody pulls it, so large loads count most."""
+        """(3,) unit vector out of the surface: a plate is pushed, never pulled, so large loads count most."""
         axis = np.cross(*self.axes)
         load = self.force @ axis
         return axis if np.sum(load * np.abs(load)) >= 0 else -axis
 
-    @property
+    @cached_property
     def axes(self) -> NDArray:
         """(2, 3) unit vectors x and y of the plate, as the order of its corners tells them."""
         a, b, c, d = self.corners
@@ -60,7 +62,7 @@ class ForcePlate:
         y = y - (y @ x) * x
         return np.stack([x, y / np.linalg.norm(y)])
 
-    @property
+    @cached_property
     def load(self) -> NDArray:
         """(N,) [N] at right angles to the plate, positive where somebody presses on it."""
         return self.force @ self.normal
@@ -96,3 +98,8 @@ class ForcePlate:
     def shifted(self, seconds: float) -> ForcePlate:
         """The same plate by a clock that is so much ahead [s]."""
         return replace(self, first_time=self.first_time + seconds)
+
+
+def total_load(plates: Sequence[ForcePlate], times: NDArray) -> NDArray:
+    """(N,) [N] on all plates together at some times (N,) [s]."""
+    return np.sum([np.interp(times, plate.times, plate.load, 0.0, 0.0) for plate in plates], axis=0)

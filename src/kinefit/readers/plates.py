@@ -2,7 +2,7 @@
 
 Source: C3D User Guide, Motion Lab Systems, 2008, "The FORCE_PLATFORM group". Files contradict it and each other:
 whether a force acts on the plate or on the person, the sign of ORIGIN, the unit of moments. What presses on a plate is
-decided by the load, which nobody lifts; the unit of moments by where the centre of pressure then is.
+decided by the load, which never lifts a plate; the unit of moments by where the centre of pressure then is.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def _placed(
 
 
 def share_inside(plate: ForcePlate) -> float:
-    """Share of loaded samples whose centre of pressure lies on the plate; 1 where nobody loads it."""
+    """Share of loaded samples whose centre of pressure lies on the plate; 1 of an unloaded plate."""
     at = plate.centre_of_pressure(5.0 * LEAST_LOAD)
     at = (at[np.isfinite(at).all(axis=1)] - plate.centre) @ plate.axes.T
     half = 0.5 * np.ptp((plate.corners - plate.centre) @ plate.axes.T, axis=0) + _MARGIN
@@ -167,7 +167,7 @@ def _units(c3d: C3d, columns: NDArray, kind: int) -> NDArray:
 
 
 def _baseline(c3d: C3d, values: NDArray, kind: int) -> tuple[NDArray | float, str]:
-    """Mean of the frames that ZERO names, where nobody loads the plate in them; else 0, and why it is not used."""
+    """Mean of the frames that ZERO names, where the plate bears no load in them; else 0, and why it is not used."""
     zero = c3d.parameters.get("FORCE_PLATFORM:ZERO")
     first, last = (int(v) for v in zero.flat[:2]) if isinstance(zero, np.ndarray) and zero.size >= 2 else (0, 0)
     load = values[:, 4:].sum(axis=1) if kind == 3 else values[:, 2]

@@ -84,7 +84,7 @@ def _shares(body: Body, table: str) -> tuple[NDArray, NDArray, NDArray]:
     tall = body.stature / generic.stature if body.stature else 1.0
     size = len(body.tree.segments)
     shares, centres, known = np.zeros(size), _middles(body), np.zeros(size, bool)
-    lengths, usual = body.segment_lengths(), generic.segment_lengths()
+    lengths, typical = body.segment_lengths(), generic.segment_lengths()
     for s, name in enumerate(body.tree.segments):
         stem, side = re.fullmatch(r"(.*?)(_[lr])?", name).groups("")  # type: ignore[union-attr]
         if stem not in rows or body.gear_scale[body.segment_scale[s]]:
@@ -94,9 +94,9 @@ def _shares(body: Body, table: str) -> tuple[NDArray, NDArray, NDArray]:
         first, last = (_point(body, s, name, side) for name in points)
         if first is not None and last is not None:
             centres[s] = _on_axis(body, s, first, last, 0.01 * way)
-        bones = [key for key in lengths.keys() & usual.keys() if key.startswith(f"{name}-")]
+        bones = [key for key in lengths.keys() & typical.keys() if key.startswith(f"{name}-")]
         if bones:
-            longer = float(np.mean([lengths[key] / usual[key] for key in bones]))
+            longer = float(np.mean([lengths[key] / typical[key] for key in bones]))
             shares[s] *= longer / tall * _thicker(body, s, generic, generic.tree.segments.index(name), longer)
     return shares, centres, known
 

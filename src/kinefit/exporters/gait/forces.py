@@ -42,10 +42,7 @@ def step_forces(motion: Motion) -> list[StepForces]:
         if not np.isfinite([step.contact, step.off]).all():
             continue
         times = step.contact + (step.off - step.contact) * PERCENT / 100.0
-        force = np.zeros((len(times), 3))
-        for name in step.plate.split(", "):
-            plate = plates[name]
-            force += np.column_stack([np.interp(times, plate.times, column, 0.0, 0.0) for column in plate.force.T])
+        force = np.sum([plates[name].at(times).force for name in step.plate.split(", ")], axis=0)
         across = _across(motion, float(times[len(times) // 2]))
         ahead = np.cross(up, across)
         ahead /= np.linalg.norm(ahead)

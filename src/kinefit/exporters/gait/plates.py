@@ -15,7 +15,7 @@ from kinefit.bodies import Body
 from kinefit.bodies.masses import segment_masses
 from kinefit.bodies.motion import Motion
 from kinefit.findings import Finding
-from kinefit.geometry.force_plates import LEAST_LOAD, ForcePlate
+from kinefit.geometry.force_plates import LEAST_LOAD, ForcePlate, total_load
 
 FOOT = "heel", "metatarsal_phalanx_1", "metatarsal_phalanx_5"
 """Landmarks of a foot, after "l_" or "r_"."""
@@ -107,8 +107,18 @@ class _Loaded:
 
 def footfalls(motion: Motion) -> list[Footfall]:
     """Steps of one foot alone on a plate, or on several plates, in the order of their contacts."""
+    return _footfalls(list(_loaded(motion)))
+
+
+def footfalls_in_time(motion: Motion, events: Events) -> list[Footfall]:
+    """As `footfalls`; none where the plates' clock is not that of the motion, as its own events (see `Events`) tell."""
+    loaded = list(_loaded(motion))
+    return _footfalls(loaded) if _lateness(loaded, events) is None else []
+
+
+def _footfalls(loaded: Sequence[_Loaded]) -> list[Footfall]:
     steps: list[tuple[int, float, float, list[_Loaded]]] = []  # side, first and last time under load
-    for one in sorted(_loaded(motion), key=lambda one: float(one.plate.times[one.first])):
+    for one in sorted(loaded, key=lambda one: float(one.plate.times[one.first])):
         if (side := _side(one)) is None:
             continue
         start, stop = float(one.plate.times[one.first]), float(one.plate.times[one.stop - 1])
@@ -180,7 +190,7 @@ def standing_mass(trials: Sequence[Sequence[ForcePlate]], body: Body) -> float |
 
 def _standing(plates: Sequence[ForcePlate], body: Body) -> float | None:
     first = min(plates, key=lambda plate: plate.first_time)
-    total = np.sum([np.interp(first.times, plate.times, plate.load, 0.0, 0.0) for plate in plates], axis=0)
+    total = total_load(plates, first.times)
     count = round(_STAND_S * first.rate)
     if len(total) < count:
         return None
@@ -188,9 +198,8 @@ def _standing(plates: Sequence[ForcePlate], body: Body) -> float | None:
     mean, std = windows.mean(axis=1), windows.std(axis=1)
     steady = mean[(std < _STEADY * mean) & (mean > LEAST_LOAD)]
     expected = segment_masses(body)
-    middle, spread = float(expected.masses.sum()), expected.std
     found = float(np.median(steady)) / GRAVITY if len(steady) else 0.0
-    return found if found and abs(found - middle) < _DOUBT * spread else None
+    return found if found and abs(found - expected.masses.sum()) < _DOUBT * expected.std else None
 
 
 def by_plates(steps: Sequence[Footfall], side: str, end: str, times: NDArray, stds: NDArray) -> tuple[NDArray, NDArray]:
@@ -206,24 +215,18 @@ def by_plates(steps: Sequence[Footfall], side: str, end: str, times: NDArray, st
     -------
     times, stds : (M,) [s], in increasing order
     """
-    found = [(getattr(step, end), CONTACT_STD_S) for step in steps if step.side == side]
-    found = [(time, std) for time, std in found if np.isfinite(time)]
-    odd = [any(_SAME_S < abs(t - time) < _STRIDE_S for t in times) for time, _ in found]
-    alike = [any(abs(t - time) <= _SAME_S for t in times) for time, _ in found]
-    found = [pair for pair, far, same in zip(found, odd, alike) if same or not far]
+    ends = [getattr(step, end) for step in steps if step.side == side]
+    found = [(time, CONTACT_STD_S) for time in ends if np.isfinite(time)]
+    nearest = [float(np.min(np.abs(times - time), initial=np.inf)) for time, _ in found]
+    found = [pair for pair, off in zip(found, nearest) if off <= _SAME_S or off >= _STRIDE_S]
     kept = [pair for pair in zip(times, stds) if all(abs(pair[0] - time) > _SAME_S for time, _ in found)]
     table = np.array(sorted([*kept, *found])).reshape(-1, 2)
     return table[:, 0], table[:, 1]
 
 
-def lateness(motion: Motion, events: Events) -> tuple[float, float, int] | None:
-    """[s] of the plates' clock beside the motion's, with its deviation and the number of events; None if it is right.
-
-    Parameters
-    ----------
-    events : contacts (N,) and toe-offs (M,) [s] of the left and of the right foot, as its motion tells them
-    """
-    late = np.array([off for one in _loaded(motion) for off in _lateness(one, events)])
+def _lateness(loaded: Sequence[_Loaded], events: Events) -> tuple[float, float, int] | None:
+    """[s] of the plates' clock beside the motion's, its deviation and the number of events; None if it is right."""
+    late = np.array([off for one in loaded for off in _late_events(one, events)])
     spread = 1.48 * float(np.median(np.abs(late - np.median(late)))) if len(late) else np.inf
     if len(late) < 2 or abs(np.median(late)) < _LATE_S or spread > _MAX_SPREAD_S:
         return None
@@ -233,15 +236,13 @@ def lateness(motion: Motion, events: Events) -> tuple[float, float, int] | None:
 def plate_findings(motion: Motion, events: Events) -> list[Finding]:
     """What is wrong with plates: moved, turned, late, or of another unit, as the feet and the load tell.
 
-    `events` as of `lateness`.
+    `events`: of the feet alone, as their motion shows them.
     """
     out, loaded = list[Finding](), list(_loaded(motion))
     if not loaded:
         return out
     weight = GRAVITY * float(segment_masses(motion.body).masses.sum())
-    times = loaded[0].plate.times
-    total = np.sum([np.interp(times, plate.times, plate.load, 0.0, 0.0) for plate in motion.plates], axis=0)
-    peak = float(total.max()) / weight
+    peak = float(total_load(motion.plates, loaded[0].plate.times).max()) / weight
     if not _LOADS[0] < peak < _LOADS[1] and len(loaded) > 1:
         text = f"The largest load on the plates is {peak:.2g} body weights: their forces are not in newtons."
         out.append(_finding(text, "Likely; a person who only touches them does the same.", "ANALOG:UNITS or SCALE"))
@@ -250,14 +251,14 @@ def plate_findings(motion: Motion, events: Events) -> list[Finding]:
             own = [one for one in loaded if one.plate is plate]
             text, confidence = _misplaced(own) if own else ("", "")
             out += [_finding(text, confidence, "CORNERS, or shift and turn of its [[plate]]")] * bool(text)
-    if (late := lateness(motion, events)) is not None:
+    if (late := _lateness(loaded, events)) is not None:
         apart = f"{late[0]:+.3f} ± {late[1]:.3f} s"
         text = f"The plates' clock is {apart} beside that of the motion: no event is taken of them."
         out.append(_finding(text, f"Likely, by {late[2]} contacts and toe-offs.", "time_offset of its [[plate]]"))
     return out
 
 
-def _lateness(one: _Loaded, events: Events) -> Iterator[float]:
+def _late_events(one: _Loaded, events: Events) -> Iterator[float]:
     """[s] from the nearest events of the foot that stands on a plate to those of its load."""
     apart = np.median(np.linalg.norm(one.offsets, axis=-1), axis=0)
     if apart.min() < _MAX_OFF:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.motion import Motion, rotation_between_up
-from kinefit.exporters.gait.plates import Footfall, by_plates, footfalls, lateness, plate_findings
+from kinefit.exporters.gait.plates import Footfall, by_plates, footfalls_in_time, plate_findings
 from kinefit.findings import Finding
 
 LEAST_STEP = 0.12  # share of the stature that a foot travels to and fro at least: shuffling 20 cm strides of an adult
@@ -98,7 +98,7 @@ def foot_events(motion: Motion, *, plates: bool = True) -> Feet | None:
     ahead = (-ahead if backwards else ahead) * observed[:, None]  # of a leg that was not measured nothing is known
     left, right = (_events(motion, name, ahead[:, s], speed[:, s], least) for s, name in enumerate(("left", "right")))
     events = [(foot.contacts, foot.offs) for foot in (left, right)]
-    steps = footfalls(motion) if plates and motion.plates and lateness(motion, events) is None else []
+    steps = footfalls_in_time(motion, events) if plates and motion.plates else []
     sides = (_with_plates(left, steps), _with_plates(right, steps))
     return Feet(*sides, belt, (bool(observed[0]), bool(observed[1])), backwards)
 
