@@ -49,6 +49,7 @@ BENCHMARKS = {
     "regions_cyclist.jpg": "python -m benchmarks regions regions_gear",
     "regions_cyclist.svg": "python -m benchmarks regions regions_gear",
     "regions_jump.jpg": "python -m benchmarks regions regions_jumps",
+    "regions_rider_rises.jpg": "python -m benchmarks regions regions_jumps",
     "regions_snowboarder.jpg": "python -m benchmarks regions regions_gear",
     "regions_snowboarder.svg": "python -m benchmarks regions regions_gear",
     "regions_snowboarder_feet.svg": "python -m benchmarks regions regions_gear",
