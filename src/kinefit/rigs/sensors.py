@@ -23,7 +23,7 @@ from kinefit.fitting.subject.parameters import KnownLengths, Parameters, PointOf
 from kinefit.fitting.subject.sensor_parameters import SensorFrames
 from kinefit.fitting.subject.subject import Subject, SubjectFit
 from kinefit.fitting.subject.surfaces import CylinderShape
-from kinefit.fitting.tracking.placing import (
+from kinefit.fitting.tracking.cameras import (
     Look,
     measurements_at,
     placed_camera,

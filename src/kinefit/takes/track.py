@@ -13,7 +13,7 @@ from kinefit.bodies.motion import Motion
 from kinefit.errors import KinefitError, TakeError, command, located
 from kinefit.exporters.gait.plates import standing_mass
 from kinefit.exporters.report.feet import plate_faults
-from kinefit.fitting.smoothing.online.lag_frame import KnownNoise
+from kinefit.fitting.smoothing.online.fixed_lag import KnownNoise
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.subject.subject import Subject
 from kinefit.fitting.tracking.cameras import as_found

@@ -20,15 +20,17 @@ from kinefit.fitting.multiview.association import (
     MAX_SPEED,
     MAX_STEP,
     Node,
+    assign,
     confidences,
     distances,
     group_views,
     heights,
     link_views,
+    match_by_boxes,
     medians,
     some_columns,
+    suppress_duplicates,
 )
-from kinefit.fitting.multiview.boxes import assign, match_by_boxes, suppress_duplicates
 from kinefit.fitting.multiview.likeness import ImageSource
 from kinefit.fitting.multiview.returns import MAX_SHORT_ABSENCE_S, Chain, PresenceSpan, Return, link_spans
 from kinefit.geometry.camera import Rig

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.lasting_errors import ParameterErrors, between
 from kinefit.fitting.frame.fit import rows_of, rows_of_points
-from kinefit.fitting.subject.matched_frames import CLOSURES, Worlds
+from kinefit.fitting.subject.fit import CLOSURES, Worlds
 from kinefit.fitting.subject.parameters import PointOffsets, stacked
 from kinefit.fitting.subject.subject import SubjectFit
 from kinefit.fitting.subject.surfaces import CylinderShape, Girths

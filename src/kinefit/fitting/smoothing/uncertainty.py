@@ -29,7 +29,7 @@ from kinefit.fitting.smoothing.sensor_noise import OtherNoise, Pushes, covarianc
 from kinefit.fitting.smoothing.shape_errors import SAMPLED_FRAMES, ShapeErrors, parameter_errors
 from kinefit.fitting.smoothing.shared_errors import SharedErrors
 from kinefit.fitting.smoothing.spool import stretches
-from kinefit.fitting.subject.matched_frames import closing_moves, point_moves
+from kinefit.fitting.subject.fit import closing_moves, point_moves
 from kinefit.fitting.subject.point_moves import ClosureMoves, PointMoves
 from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics, same_cameras
 from kinefit.fitting.subject.subject import Subject, SubjectFit

@@ -12,14 +12,15 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import TrackingError
 from kinefit.fitting.initialization.from_points import first_scales, pose_from_points
 from kinefit.fitting.subject import fit as joint
-from kinefit.fitting.subject.gear import Gear, excess
-from kinefit.fitting.subject.matched_frames import MatchedFrames, Worlds
+from kinefit.fitting.subject.fit import MatchedFrames, Worlds
 from kinefit.fitting.subject.parameters import (
+    Gear,
     KnownLengths,
     Parameters,
     PointOffsets,
     SegmentScales,
     World,
+    excess,
     place_spread,
 )
 from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.fitting.multiview.followed import only_lifted
-from kinefit.fitting.subject.fit import REACH
-from kinefit.fitting.subject.gear import Gear
-from kinefit.fitting.subject.matched_frames import MatchedFrames, Worlds
+from kinefit.fitting.subject.fit import REACH, MatchedFrames, Worlds
 from kinefit.fitting.subject.parameters import (
     UNKNOWN_SIZE_STD,
+    Gear,
     KnownLengths,
     Parameters,
     PointOffsets,

@@ -22,8 +22,7 @@ from tests.fitting.tracking.movements import (
 from kinefit import BodyState, Recording, load_body, track
 from kinefit.bodies.tree import twin
 from kinefit.errors import ObservationError
-from kinefit.fitting.smoothing.online.fixed_lag import FixedLag
-from kinefit.fitting.smoothing.online.lag_frame import KnownNoise
+from kinefit.fitting.smoothing.online.fixed_lag import FixedLag, KnownNoise
 from kinefit.fitting.smoothing.smoother import as_tracked
 from kinefit.fitting.smoothing.tracked_frames import TrackedFrames
 from kinefit.fitting.smoothing.unwrap import continued, unwrap

@@ -16,8 +16,7 @@ from typing import Any
 
 from kinefit._records import Codec, RecordFile
 from kinefit.errors import ExportError, FileError, ObservationError
-from kinefit.fitting.smoothing.record_classes import CODEC
-from kinefit.fitting.smoothing.spool import Store
+from kinefit.fitting.smoothing.spool import CODEC, Store
 from kinefit.sensors.base import Sensor
 from kinefit.sensors.points.keypoints import Layout, Stream
 
