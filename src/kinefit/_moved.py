@@ -26,6 +26,7 @@ MOVED_PATHS = {
     "fitting.subject.matched_frames": "fitting.subject.fit", "fitting.tracking.marker_steps": "fitting.tracking.run",
     "fitting.tracking.markers": "fitting.tracking.video", "fitting.tracking.placing": "fitting.tracking.cameras",
     "fitting.tracking.session": "fitting.tracking.motions", "frame": "fitting.frame", "identification": "markers",
+    "images.photogrammetry.region_growing": "images.photogrammetry.least_squares_matching",
     "initialization": "fitting.initialization", "lasting_errors": "bodies.lasting_errors", "live": "studio.live",
     "losses": "geometry.losses", "markers.first_set": "fitting.markers.first_set",
     "markers.poses": "fitting.markers.subject", "markers.sides": "fitting.markers.sides",

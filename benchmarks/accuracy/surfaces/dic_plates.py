@@ -25,7 +25,7 @@ from benchmarks.figures import LEFT_OUT, NotMeasured, amount, each, figure, peer
 from benchmarks.peers.environments import run_peer
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.images.photogrammetry.region_growing import Grid, Seeds, grow
+from kinefit.images.photogrammetry.least_squares_matching import Grid, Seeds, grow
 from kinefit.images.photogrammetry.spline_image import SplineImage
 from kinefit.images.photogrammetry.states import measure_states
 

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.images.photogrammetry.least_squares_matching import WINDOW, Matches
-from kinefit.images.photogrammetry.region_growing import MIN_CORRELATION, Grid
+from kinefit.images.photogrammetry.least_squares_matching import MIN_CORRELATION, WINDOW, Grid, Matches
 from kinefit.images.photogrammetry.seeding.unaided import grow_over_time
 from kinefit.images.photogrammetry.spline_image import SplineImage
 from kinefit.images.photogrammetry.surface import MeasuredSurface, reject_repeated_texture, reject_untextured

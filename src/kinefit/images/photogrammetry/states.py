@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.errors import ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.images.photogrammetry.least_squares_matching import WINDOW, Matches
-from kinefit.images.photogrammetry.region_growing import MIN_CORRELATION, Grid, Seeds
+from kinefit.images.photogrammetry.least_squares_matching import MIN_CORRELATION, WINDOW, Grid, Matches, Seeds
 from kinefit.images.photogrammetry.seeding.unaided import grow_between, grow_over_time, grow_through
 from kinefit.images.photogrammetry.spline_image import SplineImage
 from kinefit.images.photogrammetry.strain import Strain, grid_step, scatter, strain

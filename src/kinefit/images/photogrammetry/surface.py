@@ -11,9 +11,16 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.images.photogrammetry.intersection import intersect
-from kinefit.images.photogrammetry.least_squares_matching import WINDOW, Matches, half_sides
+from kinefit.images.photogrammetry.least_squares_matching import (
+    MIN_CORRELATION,
+    WINDOW,
+    Grid,
+    Matches,
+    Seeds,
+    grow,
+    half_sides,
+)
 from kinefit.images.photogrammetry.matching.multi_image import match_along_rays, search_box
-from kinefit.images.photogrammetry.region_growing import MIN_CORRELATION, Grid, Seeds, grow
 from kinefit.images.photogrammetry.seeding.unaided import grow_between
 from kinefit.images.photogrammetry.spline_image import SplineImage
 
