@@ -27,8 +27,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.photogrammetry.least_squares_matching import Grid
 from kinefit.images.photogrammetry.spline_image import SplineImage
-from kinefit.images.photogrammetry.states import measure_states, surface_strain
-from kinefit.images.photogrammetry.surface import measure
+from kinefit.images.photogrammetry.surface import measure, measure_states, surface_strain
 from kinefit.images.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
 from kinefit.images.photogrammetry.trajectories import Trajectories, uniform, within_bounds
 from kinefit.readers.videos.video import Video

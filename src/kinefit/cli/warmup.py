@@ -65,7 +65,7 @@ def _surfaces() -> None:
     from kinefit.geometry.se3 import transform
     from kinefit.images.photogrammetry.least_squares_matching import Grid
     from kinefit.images.photogrammetry.spline_image import SplineImage
-    from kinefit.images.photogrammetry.states import measure_states, surface_strain
+    from kinefit.images.photogrammetry.surface import measure_states, surface_strain
     from kinefit.images.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
     from kinefit.observations import SurfacePointFrame
     from kinefit.sensors.surfaces.surface_points import SurfacePointSensor
