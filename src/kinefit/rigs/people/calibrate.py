@@ -26,8 +26,8 @@ from kinefit.rigs.refine.result import Refinement
 from kinefit.rigs.refine.sightings import PersonSighting, PersonTrial, Progress
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solving.bundle.adjust import BundleState, adjust
-from kinefit.solving.bundle.body_bundle import PointProblem
 from kinefit.solving.bundle.cameras import FOCAL, TIME, CameraPrior, PointPixels
+from kinefit.solving.bundle.shape import PointProblem
 
 _MIN_CONFIDENCE = 0.3  # confidence of a keypoint that takes part in the start
 _MAX_POINTS = 2500  # points in space of the start

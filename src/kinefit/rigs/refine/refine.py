@@ -27,8 +27,8 @@ from kinefit.rigs.refine.sightings import (
     static_pixels,
 )
 from kinefit.solving.bundle.adjust import BundleState, adjust
-from kinefit.solving.bundle.body_bundle import BodyProblem
 from kinefit.solving.bundle.cameras import COLUMNS, FOCAL, POSE, RADIAL, TIME, CameraPrior, PointPixels, departure
+from kinefit.solving.bundle.shape import BodyProblem
 
 PLACE_SIGMA = 0.05
 """[m] of a camera's calibrated centre: a tripod that was knocked, not a camera that was moved."""

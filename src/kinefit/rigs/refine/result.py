@@ -13,8 +13,8 @@ from kinefit.geometry.camera import Rig
 from kinefit.rigs.refine.gauge import aligned, covariance_in_gauge
 from kinefit.rigs.refine.sightings import PersonSighting, correlation_time
 from kinefit.solving.bundle.adjust import Bundle, BundleState, adjust
-from kinefit.solving.bundle.body_bundle import BodyProblem
 from kinefit.solving.bundle.cameras import COLUMNS, FOCAL, TIME, camera_jacobian, departure
+from kinefit.solving.bundle.shape import BodyProblem
 
 MAX_STATIC_SIGMA_PX = 3.0
 """Standard deviation of a static point's residual near the person, up to which a rig is reliable."""
