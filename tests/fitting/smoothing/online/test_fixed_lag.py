@@ -28,9 +28,8 @@ from kinefit.fitting.smoothing.tracked_frames import TrackedFrames
 from kinefit.fitting.smoothing.unwrap import continued, unwrap
 from kinefit.fitting.subject.subject import Subject
 from kinefit.solving.equations import block_diagonal
-from kinefit.solving.trajectory.marginal import leave
 from kinefit.solving.trajectory.motion_prior import MotionPrior
-from kinefit.solving.trajectory.smoothing import smooth
+from kinefit.solving.trajectory.smoothing import leave, smooth
 
 COLOUR = "left", "right"
 SIGMA = dict.fromkeys(COLOUR, 2.0)

@@ -31,9 +31,8 @@ from kinefit.solving.closed import on_null_space, onto
 from kinefit.solving.correspondences.closures import every_closure, hard_equations, looped
 from kinefit.solving.equations import block_diagonal, inverse, normal_equations
 from kinefit.solving.rows import AnyRows
-from kinefit.solving.trajectory.marginal import Entering, leave
 from kinefit.solving.trajectory.motion_prior import MotionPrior
-from kinefit.solving.trajectory.smoothing import Smoothed, posterior, smooth
+from kinefit.solving.trajectory.smoothing import Entering, Smoothed, leave, posterior, smooth
 
 
 @dataclass(eq=False)
