@@ -23,7 +23,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.papers._colour_densities import COLOURS, DENSITIES, colour_cells
 from kinefit.papers.metaball_bodies import metaball_bodies
 from kinefit.papers.regions import pose_from_regions
-from kinefit.solving.correspondences.contours.rims import RimFinder
+from kinefit.solving.correspondences.contours.outlines import RimFinder
 
 IMAGES = ROOT / "docs" / "images"
 _SCALE = 3  # of the small image of regions

@@ -38,6 +38,7 @@ MOVED_PATHS = {
     "readers.video_files": "readers.videos.video_files", "recipes": "papers", "rendering": "bodies.rendering",
     "rows": "solving.rows", "serving": "studio.serving", "smoothing": "fitting.smoothing", "solvers": "solving",
     "solvers.sequence": "solving.trajectory.sequence", "solving.bundle.body_bundle": "solving.bundle.shape",
+    "solving.correspondences.contours.rims": "solving.correspondences.contours.outlines",
     "solving.pixels": "solving.least_squares", "solving.trajectory.marginal": "solving.trajectory.smoothing",
     "subject": "fitting.subject", "tracking": "fitting.tracking", "viewers": "studio.viewers",
 }  # fmt: skip

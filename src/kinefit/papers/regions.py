@@ -28,8 +28,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.papers._colour_densities import COLOURS, DENSITIES, colour_cells
 from kinefit.solving.correspondences import point_rows
 from kinefit.solving.correspondences.closures import closure_targets
-from kinefit.solving.correspondences.contours.outlines import outline_rows
-from kinefit.solving.correspondences.contours.rims import RimFinder
+from kinefit.solving.correspondences.contours.outlines import RimFinder, outline_rows
 from kinefit.solving.least_squares import gauss_newton
 from kinefit.solving.rows import Rows
 

@@ -53,7 +53,7 @@ from kinefit.solving.correspondences import (
     surface_rows,
     target_rows,
 )
-from kinefit.solving.correspondences.contours.rims import Rim
+from kinefit.solving.correspondences.contours.outlines import Rim
 from kinefit.solving.correspondences.occupancy.collisions import CollisionPairs
 from kinefit.solving.correspondences.occupancy.depth_image import SurfaceSamples
 from kinefit.solving.correspondences.occupancy.free_space import FreeSpace

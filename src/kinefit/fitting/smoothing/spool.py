@@ -32,7 +32,7 @@ from kinefit.sensors.surfaces.depth_image import DepthImageMatched, DepthImageMe
 from kinefit.sensors.surfaces.point_cloud import FreePairs, PointCloudMatched, PointCloudMeasurement, SurfacePairs
 from kinefit.sensors.surfaces.surface_points import SurfacePointMatched, SurfacePointMeasurement
 from kinefit.sensors.visibility.occlusion import Hidden
-from kinefit.solving.correspondences.contours.rims import Rim
+from kinefit.solving.correspondences.contours.outlines import Rim
 
 CODEC = Codec([
     BodyState, PointSet, SurfaceAnchors, Rim, FrameResult, Ratios, RegionColours, Loss, Leftover, RowsOf,

@@ -28,7 +28,7 @@ from kinefit.errors import BodyError
 from kinefit.geometry.camera import Camera
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, BELIEVED, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.visibility import _kernels_visibility as kernels
-from kinefit.solving.correspondences.contours.rims import RimFinder
+from kinefit.solving.correspondences.contours.outlines import RimFinder
 from kinefit.solving.correspondences.occupancy.depth_image import SurfaceSamples
 from kinefit.solving.correspondences.targets import check_depth_image
 
