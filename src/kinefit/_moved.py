@@ -39,6 +39,7 @@ MOVED_PATHS = {
     "rows": "solving.rows", "serving": "studio.serving", "smoothing": "fitting.smoothing", "solvers": "solving",
     "solvers.sequence": "solving.trajectory.sequence", "solving.bundle.body_bundle": "solving.bundle.shape",
     "solving.correspondences.contours.rims": "solving.correspondences.contours.outlines",
+    "solving.correspondences.occupancy.depth_image": "solving.correspondences.occupancy.free_space",
     "solving.pixels": "solving.least_squares", "solving.trajectory.marginal": "solving.trajectory.smoothing",
     "subject": "fitting.subject", "tracking": "fitting.tracking", "viewers": "studio.viewers",
 }  # fmt: skip

@@ -55,8 +55,7 @@ from kinefit.solving.correspondences import (
 )
 from kinefit.solving.correspondences.contours.outlines import Rim
 from kinefit.solving.correspondences.occupancy.collisions import CollisionPairs
-from kinefit.solving.correspondences.occupancy.depth_image import SurfaceSamples
-from kinefit.solving.correspondences.occupancy.free_space import FreeSpace
+from kinefit.solving.correspondences.occupancy.free_space import FreeSpace, SurfaceSamples
 
 LENSES = (("radtan", (-0.1, 0.05, 0.001, -0.002, 0.01)), ("radtan", ()), ("fisheye", (0.02, -0.01, 0.003, -0.001)))
 
