@@ -16,8 +16,7 @@ from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
 from kinefit.rigs.bar.bundle import INTERIOR, BarBundle, adjust_bar, bar_bundle
-from kinefit.rigs.bar.placing import on_floor, place
-from kinefit.rigs.bar.start import MIN_PLACES, first_pairs, inlier_distance, resect, with_focal
+from kinefit.rigs.bar.start import MIN_PLACES, first_pairs, inlier_distance, on_floor, place, resect, with_focal
 from kinefit.rigs.bar.targets import BarViews
 from kinefit.rigs.board.intrinsics import coverage, known_camera
 from kinefit.solving.bundle.cameras import FOCAL
