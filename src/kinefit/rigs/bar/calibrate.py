@@ -18,7 +18,7 @@ from kinefit.geometry.se3 import log_so3
 from kinefit.rigs.bar.bundle import INTERIOR, BarBundle, adjust_bar, bar_bundle
 from kinefit.rigs.bar.start import MIN_PLACES, first_pairs, inlier_distance, on_floor, place, resect, with_focal
 from kinefit.rigs.bar.targets import BarViews
-from kinefit.rigs.board.intrinsics import coverage, known_camera
+from kinefit.rigs.board.extrinsics import coverage, known_camera
 from kinefit.solving.bundle.cameras import FOCAL
 
 _ADVISED_PLACES = 50  # of one camera; with fewer the distortion is poorly determined
