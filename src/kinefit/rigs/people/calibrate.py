@@ -22,8 +22,7 @@ from kinefit.rigs.people.floor import settled
 from kinefit.rigs.people.skeletons import first_cameras, in_step, steady_person
 from kinefit.rigs.refine.gauge import resized
 from kinefit.rigs.refine.refine import Length, check_input, length_of, prior_sigma, refine_from
-from kinefit.rigs.refine.result import Refinement
-from kinefit.rigs.refine.sightings import PersonSighting, PersonTrial, Progress
+from kinefit.rigs.refine.result import PersonSighting, PersonTrial, Progress, Refinement
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solving.bundle.adjust import BundleState, adjust
 from kinefit.solving.bundle.cameras import FOCAL, TIME, CameraPrior, PointPixels

@@ -15,12 +15,17 @@ from kinefit.geometry.camera import Rig
 from kinefit.geometry.lines import triangulate
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.rigs.refine.gauge import aligned, resized
-from kinefit.rigs.refine.result import MAX_STATIC_SIGMA_PX, CameraChange, Refinement, bias, chance, changes_of
-from kinefit.rigs.refine.sightings import (
+from kinefit.rigs.refine.result import (
+    MAX_STATIC_SIGMA_PX,
+    CameraChange,
     PersonSighting,
     PersonTrial,
     Progress,
+    Refinement,
+    bias,
     body_model,
+    chance,
+    changes_of,
     pixel_frames,
     sight,
     spread_frames,
