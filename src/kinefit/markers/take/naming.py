@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.markers.frame.beliefs import Beliefs, Identification, learn_beliefs
+from kinefit.markers.frame.identify import Beliefs, Identification, learn_beliefs
 from kinefit.markers.model.model import MarkerModel
 from kinefit.markers.take.consistency import Consistency
 from kinefit.markers.take.votes import Pieces, Votes, assign_pieces

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.markers.frame.beliefs import Identification
+from kinefit.markers.frame.identify import Identification
 from kinefit.markers.take._kernels_tracks import link_points
 
 MAX_ACCELERATION = 250.0
