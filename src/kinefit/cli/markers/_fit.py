@@ -21,8 +21,7 @@ from kinefit.exporters.skeletons.common import plain_names
 from kinefit.findings import FINDINGS, Finding, as_records, faults_of
 from kinefit.fitting.markers.subject import MarkerSubject
 from kinefit.markers.model.from_frame import model_from_frame
-from kinefit.markers.model.gate import TrainingFinding, training_gate
-from kinefit.markers.model.learn import learn_model
+from kinefit.markers.model.learn import TrainingFinding, learn_model, training_gate
 from kinefit.markers.model.model import MarkerModel, load_model
 from kinefit.markers.take.takes import (
     TakeIdentification,
