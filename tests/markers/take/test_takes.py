@@ -9,8 +9,8 @@ from kinefit.errors import ObservationError
 from kinefit.markers.frame.identify import Identification
 from kinefit.markers.model.learn import learn_model
 from kinefit.markers.take.consistency import Consistency, fill_gaps, gaps_of
+from kinefit.markers.take.naming import Votes, assign_pieces, find_pieces
 from kinefit.markers.take.takes import TakeSettings, identify_people, identify_take, one_after_the_other
-from kinefit.markers.take.votes import Votes, assign_pieces, find_pieces
 from kinefit.observations import Markers
 from kinefit.simulation import squat_and_wave
 

@@ -16,8 +16,7 @@ from kinefit.findings import runs_of
 from kinefit.markers.frame.identify import Beliefs, Identification, IdentifySettings, identify
 from kinefit.markers.model.model import MarkerModel, load_model
 from kinefit.markers.take.consistency import Consistency, fill_gaps
-from kinefit.markers.take.naming import INLIER_SIGMAS, OUTLIER_SIGMAS, Naming, Step
-from kinefit.markers.take.votes import find_pieces
+from kinefit.markers.take.naming import INLIER_SIGMAS, OUTLIER_SIGMAS, Naming, Step, find_pieces
 from kinefit.observations import Markers
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
