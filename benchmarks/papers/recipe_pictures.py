@@ -15,8 +15,8 @@ from benchmarks.figures import ROOT
 from kinefit.bodies import Body, BodyState, PointSet, load_body
 from kinefit.bodies.rendering import render_body
 from kinefit.bodies.surfaces import MeshSurface, Metaballs
+from kinefit.bodies.surfaces.mesh import BodyMesh
 from kinefit.bodies.surfaces.places import body_mesh, sample
-from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.bodies.tree import KinematicTree
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig

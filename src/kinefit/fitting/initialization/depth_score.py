@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.limbs import limbs, of_fingers
 from kinefit.bodies.rendering import Canvas, rasterise
+from kinefit.bodies.surfaces.mesh import BodyMesh
 from kinefit.bodies.surfaces.places import body_mesh
-from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.sensors.surfaces import _kernels_depth_view as kernels
 from kinefit.sensors.surfaces.depth_view import DepthView
 from kinefit.solving.correspondences.occupancy.collisions import CollisionPairs, collision_pairs

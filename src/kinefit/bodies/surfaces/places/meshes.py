@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
-from kinefit.bodies.surfaces.triangles import BodyMesh, triangles
+from kinefit.bodies.surfaces.mesh import BodyMesh, triangles
 from kinefit.errors import BodyError
 
 
