@@ -12,8 +12,9 @@ from typing import Any
 MOVED_PATHS = {
     "app": "studio.app", "assets": "readers.assets", "batch": "takes.batch", "batch.viewed": "studio.viewers.viewed",
     "bodies.anny": "bodies.morphs.anny", "bodies.body_surfaces": "bodies.surfaces.places",
-    "bodies.joint_names": "bodies.toml.joint_names", "bodies.surfaces.triangles": "bodies.surfaces.mesh",
-    "calibration": "rigs", "correspondences": "solving.correspondences", "diagnostics": "rigs.diagnostics",
+    "bodies.closures": "bodies.tree", "bodies.joint_names": "bodies.toml.joint_names",
+    "bodies.surfaces.triangles": "bodies.surfaces.mesh", "calibration": "rigs",
+    "correspondences": "solving.correspondences", "diagnostics": "rigs.diagnostics",
     "diagnostics.sensors": "sensors.alignment", "diagnostics.views": "fitting.multiview.views",
     "evaluation": "simulation.evaluation", "fitting.frame.minimum": "fitting.frame.fit",
     "fitting.frame.trust": "fitting.frame.results",

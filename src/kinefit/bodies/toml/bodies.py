@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit._files import parse_toml, read_text, record_of
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.closures import KINDS, Closure, Dimension
 from kinefit.bodies.morphs.morph_files import morphs_of
 from kinefit.bodies.parts import with_dimensions
 from kinefit.bodies.surfaces.files import surfaces_of
@@ -39,7 +38,7 @@ from kinefit.bodies.toml.records import (
     size_of,
     with_images,
 )
-from kinefit.bodies.tree import COLUMNS, KinematicTree
+from kinefit.bodies.tree import COLUMNS, KINDS, Closure, Dimension, KinematicTree
 from kinefit.errors import BodyError, check_choice, choices, located
 
 JOINT_TYPES = {"fixed": 0, "revolute": 1, "prismatic": 1, "universal": 2, "ball": 3, "free": 6}

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.bodies.closures import Closure, Dimension
 from kinefit.bodies.parts import known_gear, with_dimensions, with_places
+from kinefit.bodies.tree import Closure, Dimension
 from kinefit.errors import BodyError, ObservationError, check_choice
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig

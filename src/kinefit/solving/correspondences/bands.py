@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet, TaperedCylinder
-from kinefit.bodies.closures import Closure
+from kinefit.bodies.tree import Closure
 from kinefit.errors import BodyError, ObservationError, check_choice
 from kinefit.solving.correspondences import targets
 from kinefit.solving.rows import PairRows
