@@ -44,6 +44,7 @@ MOVED_PATHS = {
     "rigs.refine.sightings": "rigs.refine.result", "rows": "solving.rows", "serving": "studio.serving",
     "simulation.replay": "simulation.figures", "smoothing": "fitting.smoothing", "solvers": "solving",
     "solvers.sequence": "solving.trajectory.sequence", "solving.bundle.body_bundle": "solving.bundle.shape",
+    "solving.correspondences.anchored": "solving.correspondences.surfaces",
     "solving.correspondences.contours.rims": "solving.correspondences.contours.outlines",
     "solving.correspondences.occupancy.depth_image": "solving.correspondences.occupancy.free_space",
     "solving.pixels": "solving.least_squares", "solving.trajectory.marginal": "solving.trajectory.smoothing",

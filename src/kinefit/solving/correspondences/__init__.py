@@ -1,6 +1,5 @@
 """Row makers: observations and a body at a state to linearised measurements, one file for each kind."""
 
-from kinefit.solving.correspondences.anchored import anchored_rows, target_rows
 from kinefit.solving.correspondences.bands import Bands, band_rows, coincidence_rows, joint_bands
 from kinefit.solving.correspondences.closures import closure_rows
 from kinefit.solving.correspondences.contours.morphed import morphed_outline_rows, morphed_rows
@@ -18,7 +17,7 @@ from kinefit.solving.correspondences.points import (
     prior_rows,
     ray_rows,
 )
-from kinefit.solving.correspondences.surfaces import field_rows, surface_rows
+from kinefit.solving.correspondences.surfaces import anchored_rows, field_rows, surface_rows, target_rows
 
 __all__ = [
     "Bands", "anchored_rows", "band_rows", "closure_rows", "coincidence_rows", "collision_rows", "depth_image_rows",
