@@ -30,7 +30,7 @@ MOVED_PATHS = {
     "images.photogrammetry.region_growing": "images.photogrammetry.least_squares_matching",
     "images.photogrammetry.states": "images.photogrammetry.surface", "initialization": "fitting.initialization",
     "lasting_errors": "bodies.lasting_errors", "live": "studio.live", "losses": "geometry.losses",
-    "markers.first_set": "fitting.markers.first_set", "markers.frame.beliefs": "markers.frame.identify",
+    "markers.first_set": "fitting.markers.first_set",
     "markers.frame.polish": "markers.frame.explain", "markers.model.gate": "markers.model.learn",
     "markers.poses": "fitting.markers.subject", "markers.sides": "fitting.markers.sides",
     "markers.subject": "fitting.markers.subject", "markers.take.votes": "markers.take.naming",

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from benchmarks.papers.markers.synthetic_points import random_pose, synthetic_body
 
-from kinefit.markers.frame.identify import MAX_NOISE, MIN_NOISE, Beliefs, identify, learn_beliefs
+from kinefit.markers.frame.beliefs import MAX_NOISE, MIN_NOISE, Beliefs, learn_beliefs
+from kinefit.markers.frame.identify import identify
 from kinefit.markers.frame.search import LabelSearch, UnlabelledFrame
 from kinefit.markers.frame.tables import segment_tables
 

@@ -28,7 +28,6 @@ from kinefit.readers.guess.views import black_bars, picture
 from kinefit.readers.take.cameras import calibrated_size
 from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.take.entries import CameraEntry, Take
-from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.readers.take.videos import TakePictures
 from kinefit.readers.videos.video import Video
