@@ -40,7 +40,7 @@ MOVED_PATHS = {
     "readers.keypoints": "readers.landmarks.keypoints", "readers.sound": "readers.videos.sound",
     "readers.video": "readers.videos.video", "readers.video_files": "readers.videos.video_files", "recipes": "papers",
     "rendering": "bodies.rendering", "rigs.bar.placing": "rigs.bar.start", "rigs.bar.report": "rigs.bar.calibrate",
-    "rigs.board.intrinsics": "rigs.board.extrinsics", "rigs.diagnostics.lenient": "rigs.diagnostics.images",
+    "rigs.board.intrinsics": "rigs.board.extrinsics",
     "rigs.refine.sightings": "rigs.refine.result", "rows": "solving.rows", "serving": "studio.serving",
     "simulation.replay": "simulation.figures", "smoothing": "fitting.smoothing", "solvers": "solving",
     "solvers.sequence": "solving.trajectory.sequence", "solving.bundle.body_bundle": "solving.bundle.shape",
