@@ -23,7 +23,7 @@ from kinefit.readers.calibration.read import found_notes
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.videos import TakePictures
-from kinefit.rigs.diagnostics import cameras, changes, frozen, images, mistakes, person, rig, timing
+from kinefit.rigs.diagnostics import cameras, changes, frozen, images, lenient, mistakes, person, rig, timing
 from kinefit.rigs.diagnostics.cameras import CameraBias
 from kinefit.rigs.diagnostics.rig import CameraCoverage
 from kinefit.rigs.diagnostics.timing import TimeOffsets
@@ -175,7 +175,7 @@ def check_keypoints(
 
 
 def _calibration(c: Checked) -> list[Finding]:
-    c.take, stated, found = images.calibrated(c.take)
+    c.take, stated, found = lenient.calibrated(c.take)
     c.sound, c.rig = stated is not None, stated or Rig(())
     return found
 
@@ -194,7 +194,7 @@ def _pictures(c: Checked) -> list[Finding]:
 
 
 def _image_frames(c: Checked) -> list[Finding]:
-    c.take, found = images.framed_keypoints(c.take)
+    c.take, found = lenient.framed_keypoints(c.take)
     return found
 
 
