@@ -7,7 +7,7 @@ import pytest
 from tests.fitting.subject import measured
 from tests.fitting.subject.measured import ARM, RIG
 
-from kinefit.fitting.smoothing.shape_errors import ShapeErrors, shape_errors
+from kinefit.fitting.smoothing.border import ShapeErrors, shape_errors
 from kinefit.fitting.subject.fit import Worlds, fit_subject
 from kinefit.fitting.subject.parameters import PointOffsets, SegmentScales, World
 from kinefit.geometry.camera import Rig

@@ -24,9 +24,9 @@ from kinefit._mapped import release, room
 from kinefit.bodies import Body, BodyState, KinematicTree
 from kinefit.bodies.lasting_errors import KEYS_AT_ONCE, LastingErrors, ParameterErrors, key_frames
 from kinefit.fitting.frame.results import FrameResult
+from kinefit.fitting.smoothing.border import SAMPLED_FRAMES, ShapeErrors, parameter_errors
 from kinefit.fitting.smoothing.process_noise import SmoothTake
 from kinefit.fitting.smoothing.sensor_noise import OtherNoise, Pushes, covariance_alone, filled, leverages
-from kinefit.fitting.smoothing.shape_errors import SAMPLED_FRAMES, ShapeErrors, parameter_errors
 from kinefit.fitting.smoothing.shared_errors import SharedErrors
 from kinefit.fitting.smoothing.spool import stretches
 from kinefit.fitting.subject.fit import closing_moves, point_moves

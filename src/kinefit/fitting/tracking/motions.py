@@ -19,10 +19,9 @@ from kinefit.bodies import Body, BodyState
 from kinefit.bodies.motion import UP_AXES, Motion, Residuals
 from kinefit.errors import ObservationError, choices
 from kinefit.fitting.frame.results import FrameResult
-from kinefit.fitting.smoothing.border import Border
+from kinefit.fitting.smoothing.border import Border, shape_errors
 from kinefit.fitting.smoothing.online.fixed_lag import FixedLag, KnownNoise
 from kinefit.fitting.smoothing.sensor_noise import noise_of_sensors
-from kinefit.fitting.smoothing.shape_errors import shape_errors
 from kinefit.fitting.smoothing.smoother import as_tracked, smooth_results
 from kinefit.fitting.smoothing.spool import STRETCH, Spool
 from kinefit.fitting.smoothing.tracked_frames import TrackedFrames, TrackerLike
