@@ -28,6 +28,7 @@ MOVED_PATHS = {
     "fitting.subject.matched_frames": "fitting.subject.fit", "fitting.tracking.marker_steps": "fitting.tracking.run",
     "fitting.tracking.markers": "fitting.tracking.video", "fitting.tracking.placing": "fitting.tracking.cameras",
     "fitting.tracking.session": "fitting.tracking.motions", "frame": "fitting.frame", "identification": "markers",
+    "images.photogrammetry.flat": "images.photogrammetry.surface",
     "images.photogrammetry.matching._kernels_spline": "images.photogrammetry.matching._kernels_matching",
     "images.photogrammetry.region_growing": "images.photogrammetry.least_squares_matching",
     "images.photogrammetry.states": "images.photogrammetry.surface", "initialization": "fitting.initialization",
