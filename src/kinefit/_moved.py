@@ -50,8 +50,10 @@ MOVED_PATHS = {
     "solving.correspondences.anchored": "solving.correspondences.surfaces",
     "solving.correspondences.contours.rims": "solving.correspondences.contours.outlines",
     "solving.correspondences.occupancy.depth_image": "solving.correspondences.occupancy.free_space",
-    "solving.pixels": "solving.least_squares", "solving.trajectory.marginal": "solving.trajectory.smoothing",
-    "subject": "fitting.subject", "tracking": "fitting.tracking", "viewers": "studio.viewers",
+    "solving.pixels": "solving.least_squares",
+    "solving.trajectory._kernels_sequence": "solving.trajectory._kernels_smoothing",
+    "solving.trajectory.marginal": "solving.trajectory.smoothing", "subject": "fitting.subject",
+    "tracking": "fitting.tracking", "viewers": "studio.viewers",
 }  # fmt: skip
 """{path below `kinefit` in 0.2: path now}; what lies below a path moved with it."""
 

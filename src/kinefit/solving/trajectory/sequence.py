@@ -13,7 +13,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.losses import SQUARED, Loss
 from kinefit.solving.equations import lock
 from kinefit.solving.least_squares import bounds_of
-from kinefit.solving.trajectory._kernels_sequence import fit_sequence as _fit_sequence
+from kinefit.solving.trajectory._kernels_smoothing import fit_sequence as _fit_sequence
 
 _NO_POINTS = PointSet((), np.empty(0, np.int64), np.empty((0, 3)))
 
