@@ -52,6 +52,7 @@ MOVED_PATHS = {
     "solving.correspondences.occupancy.depth_image": "solving.correspondences.occupancy.free_space",
     "solving.pixels": "solving.least_squares",
     "solving.trajectory._kernels_sequence": "solving.trajectory._kernels_smoothing",
+    "solving.trajectory._kernels_shared": "solving.trajectory._kernels_smoothing",
     "solving.trajectory.marginal": "solving.trajectory.smoothing", "subject": "fitting.subject",
     "tracking": "fitting.tracking", "viewers": "studio.viewers",
 }  # fmt: skip
