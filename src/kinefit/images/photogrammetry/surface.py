@@ -388,9 +388,6 @@ def rigid_motion(reference: NDArray, state: NDArray) -> tuple[NDArray, NDArray]:
     return T, state - se3.apply(T, reference)
 
 
-_EXACT_VARIANCE = 1e-6  # [px²] of the points in the first image, which are exact by definition
-
-
 def measure_flat(
     states: Sequence[SplineImage],
     grid: Grid,
