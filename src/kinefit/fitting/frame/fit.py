@@ -12,21 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.fitting.frame import results
 from kinefit.fitting.frame.prediction import prediction_row, release_dofs
-from kinefit.fitting.frame.results import (
-    ROOT_PRIOR_STD,
-    FrameResult,
-    angles_off_prediction,
-    dofs_moving,
-    dofs_of_joints,
-    evidence_of,
-    frame_result,
-    observed,
-    reset_to_prior,
-    segments_not_shown,
-    sum_evidence,
-    without_segments,
-)
 from kinefit.fitting.frame.skin import has_surface_offset, skin_of
 from kinefit.sensors.base import Matched, Measurement, matched_by, packed, rows_at
 from kinefit.sensors.evidence import Evidence
@@ -119,7 +106,7 @@ class Fitted:
     released : (n,) bool, optional: degrees of freedom whose prediction was discarded
     """
 
-    result: FrameResult
+    result: results.FrameResult
     filtered: NDArray
     stated: NDArray
     seen: NDArray
@@ -160,20 +147,20 @@ class FrameFit:
         points = [m for m in measurements if m.settled]
         every = len(points) == len(measurements)
         best = self._fit(scene, held, measurements)
-        evidence = evidence_of(best.scene, best.matched)
-        if points and sum_evidence(scene, [e for e, m in zip(evidence, measurements) if m.settled]).lost.any():
+        evidence = results.evidence_of(best.scene, best.matched)
+        if points and results.sum_evidence(scene, [e for e, m in zip(evidence, measurements) if m.settled]).lost.any():
             other = self._fit_to_minimum(scene, held, points, self._initial_reach(held))
             other = other if every else self._fit_step_by_step(other.scene, held, measurements)
-            new = evidence_of(other.scene, other.matched)
+            new = results.evidence_of(other.scene, other.matched)
             gain = best.cost - other.cost if every else sum(e.balance for e in new) - sum(e.balance for e in evidence)
             if gain > 0.0:
                 best, evidence = other, new
         released: NDArray | None = None
         for m, first_evidence in zip(measurements, list(evidence)):
             for state in m.starts(scene, None if held is None else held[1], first_evidence):
-                free = None if held is None else angles_off_prediction(*held, state)
+                free = None if held is None else results.angles_off_prediction(*held, state)
                 other = self._fit(scene.at(state), release_dofs(held, free), measurements)
-                new = evidence_of(other.scene, other.matched)
+                new = results.evidence_of(other.scene, other.matched)
                 better = m.better(other.scene, best.scene)
                 if better is None:
                     better = sum(e.balance for e in new) > sum(e.balance for e in evidence)
@@ -237,7 +224,7 @@ class FrameFit:
             return self.settings.far
         moves = joint_moves(self.body, held[0])
         variance = np.einsum("...i,...i->...", moves @ inverse(held[1]), moves).sum(axis=1)
-        return float(np.clip(np.sqrt(variance.max()), self.settings.far, ROOT_PRIOR_STD))
+        return float(np.clip(np.sqrt(variance.max()), self.settings.far, results.ROOT_PRIOR_STD))
 
     def rows(
         self, scene: Scene, held: Held | None, matched: Sequence[Matched], *, apart: bool = False,
@@ -269,12 +256,12 @@ class FrameFit:
 
     def _assess(self, found: Minimum, held: Held | None, each: Sequence[Evidence], known: NDArray | None) -> Fitted:
         """Covariances and quality of a fit, without rows on contradicted segments and of surfaces that occlude one."""
-        scene, tree, evidence = found.scene, self.body.tree, sum_evidence(found.scene, each)
+        scene, tree, evidence = found.scene, self.body.tree, results.sum_evidence(found.scene, each)
         A = np.zeros((0, tree.n_dofs)) if self._hard is None else self._hard(scene.state)[1]
         exact = A.T @ A / HARD_SIGMA**2
         H = found.H + exact
         lost = evidence.lost if evidence.lost.any() else None
-        off = [segments_not_shown(m, e) for m, e in zip(found.matched, each)]
+        off = [results.segments_not_shown(m, e) for m, e in zip(found.matched, each)]
         if lost is not None:
             off = [lost if segments is None else lost | segments for segments in off]
         without = off if any(segments is not None and segments.any() for segments in off) else None
@@ -294,9 +281,9 @@ class FrameFit:
         stated = posterior + self._surface_covariance(scene, found.matched, now, without)
         if lost is not None:
             elsewhere = np.zeros(len(lost), bool) if evidence.elsewhere is None else lost & evidence.elsewhere
-            gone = dofs_of_joints(tree, elsewhere) | (dofs_moving(tree, lost) & ~seen)
-            known, stated = known & ~gone[6:], reset_to_prior(tree, stated, gone)
-        result = frame_result(scene, stated, found.matched, found.iterations, observed=known, evidence=evidence)
+            gone = results.dofs_of_joints(tree, elsewhere) | (results.dofs_moving(tree, lost) & ~seen)
+            known, stated = known & ~gone[6:], results.reset_to_prior(tree, stated, gone)
+        result = results.frame_result(scene, stated, found.matched, found.iterations, observed=known, evidence=evidence)
         if lost is not None:
             result = replace(result, joint_std=np.where(elsewhere[:, None], np.inf, result.joint_std))
         return Fitted(result, inverse(alone), stated, seen[6:], known)
@@ -318,7 +305,7 @@ class FrameFit:
 
         A joint that moves points of images by less than `MIN_LEVER` is observed only if other sensors observe it.
         """
-        seen = observed(self.body.tree, now)
+        seen = results.observed(self.body.tree, now)
         moved = [m.moves(scene) for m in matched]
         moving = [of_points for of_points in moved if of_points is not None]
         if not moving:
@@ -330,7 +317,7 @@ class FrameFit:
                 off = without and [without[k] for k in others]
                 rows = self.rows(scene, None, [matched[k] for k in others], without=off)
                 H = normal_equations(self.body, scene.state, rows).matrix + _PRIOR_REMAINDER * np.eye(len(now))
-                short &= ~observed(self.body.tree, H)[6:]
+                short &= ~results.observed(self.body.tree, H)[6:]
             seen[6:] &= ~short
         return seen
 
@@ -371,7 +358,7 @@ def _kinds(
     for m, off in zip(matched, without or [None] * len(matched)):
         for rows in rows_at(m, scene):
             rows = weaker(rows, (scale or {}).get(m.sensor, 1.0))
-            rows = rows if off is None else without_segments(rows, off)
+            rows = rows if off is None else results.without_segments(rows, off)
             if has_surface_offset(rows, m):
                 surface.append(rows)
             else:

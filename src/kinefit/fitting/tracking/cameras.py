@@ -26,15 +26,7 @@ from kinefit.sensors.base import Matched, Measurement, rows_at
 from kinefit.sensors.displaced import Displaced, displacement
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import CameraErrors, TrackSettings
-from kinefit.sensors.surfaces.point_cloud import (
-    COARSE_DISTANCES,
-    FINE_DISTANCES,
-    Ends,
-    Registration,
-    clearly_above,
-    starts,
-    values_of,
-)
+from kinefit.sensors.surfaces import point_cloud
 from kinefit.solving.rows import Rows
 
 CAMERAS = "cameras"
@@ -225,7 +217,7 @@ def measurements_at(look: Look, sensors: Sensors, centre: NDArray, twists: dict[
     """What sensors measured about the person, if each belongs at its twist (7,) about a centre; default: zero."""
     (frames, scene), out = look, list[Measurement]()
     for frame in frames:
-        T = displacement(values_of(twists.get(frame.sensor, np.zeros(7))), centre)
+        T = displacement(point_cloud.values_of(twists.get(frame.sensor, np.zeros(7))), centre)
         there = scene.at(BodyState(se3.inverse(T) @ scene.state.T_world_root, scene.state.angles))
         out += [Displaced(m, centre) for m in sensors.measurements([frame], there)]
     return out
@@ -233,13 +225,13 @@ def measurements_at(look: Look, sensors: Sensors, centre: NDArray, twists: dict[
 
 def registration(
     sensor: str, looks: Sequence[Look], sensors: Sensors, origin: NDArray, centre: NDArray, twist: NDArray | None = None
-) -> Registration:
+) -> point_cloud.Registration:
     """What one sensor with its origin (3,) measured about the person, if it belongs at a twist about the centre."""
     own = [([f for f in frames if f.sensor == sensor], scene) for frames, scene in looks]
     own = [look for look in own if look[0]]
     steps = [measurements_at(look, sensors, centre, {} if twist is None else {sensor: twist}) for look in own]
     prior = SensorFrames((sensor,), POSE_SIGMAS, {sensor: origin - centre}).information
-    return Registration(sensor, steps, [scene for _, scene in own], centre, prior[:6, :6])
+    return point_cloud.Registration(sensor, steps, [scene for _, scene in own], centre, prior[:6, :6])
 
 
 def placed_cameras(recording: Recording, subject: Subject, settings: TrackSettings) -> dict[str, SensorAlignment]:
@@ -264,23 +256,24 @@ def placed_cameras(recording: Recording, subject: Subject, settings: TrackSettin
 def placed_camera(
     sensor: str, looks: Sequence[Look], sensors: Sensors, T_camera_world: NDArray, centre: NDArray, *,
     thorough: bool = False,
-) -> tuple[SensorAlignment, Ends | None]:  # fmt: skip
+) -> tuple[SensorAlignment, point_cloud.Ends | None]:  # fmt: skip
     """Where one depth camera belongs, and the ends of all starts, if the stated pose is not near or if `thorough`."""
     origin, still = se3.inverse(T_camera_world)[:3, 3], np.zeros(7)
     stated = registration(sensor, looks, sensors, origin, centre)
     covariance, ends = np.diag(np.repeat(POSE_SIGMAS, (3, 3, 1)) ** 2), None
-    found = SensorAlignment(sensor, "depth", still if thorough else stated.settled(still, FINE_DISTANCES), covariance,
-                            centre)  # fmt: skip
+    twist = still if thorough else stated.settled(still, point_cloud.FINE_DISTANCES)
+    found = SensorAlignment(sensor, "depth", twist, covariance, centre)
     if thorough or not found.is_near:
-        reach = *COARSE_DISTANCES, *FINE_DISTANCES
-        ends = Ends(stated, tuple(stated.settled(s, reach) for s in starts(origin, centre, POSE_SIGMAS[:2])))
+        reach = *point_cloud.COARSE_DISTANCES, *point_cloud.FINE_DISTANCES
+        starts = point_cloud.starts(origin, centre, POSE_SIGMAS[:2])
+        ends = point_cloud.Ends(stated, tuple(stated.settled(s, reach) for s in starts))
         found = replace(found, twist=ends.best)
     axis = np.pi * T_camera_world[2, :3]
     way = centre - origin
     over = np.concatenate([se3.exp_so3(axis) @ way - way, axis, [0.0]])
     rolled = registration(sensor, looks, sensors, origin, centre, over)
-    over = rolled.settled(over, FINE_DISTANCES)
-    if clearly_above(stated.costs(found.twist), rolled.costs(over)):
+    over = rolled.settled(over, point_cloud.FINE_DISTANCES)
+    if point_cloud.clearly_above(stated.costs(found.twist), rolled.costs(over)):
         return replace(found, twist=over), None
     return replace(found, falls=stated.above(still, found.twist)), ends
 

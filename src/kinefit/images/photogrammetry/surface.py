@@ -16,16 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
+from kinefit.images.photogrammetry import least_squares_matching as matching
 from kinefit.images.photogrammetry.intersection import intersect
-from kinefit.images.photogrammetry.least_squares_matching import (
-    MIN_CORRELATION,
-    WINDOW,
-    Grid,
-    Matches,
-    Seeds,
-    grow,
-    half_sides,
-)
 from kinefit.images.photogrammetry.matching.multi_image import match_along_rays, search_box
 from kinefit.images.photogrammetry.seeding.unaided import grow_between, grow_over_time, grow_through
 from kinefit.images.photogrammetry.spline_image import SplineImage
@@ -56,7 +48,7 @@ class MeasuredSurface:
     deformation : (N, C - 1, 2, 2) maps an offset in the first image to each other image
     """
 
-    grid: Grid
+    grid: matching.Grid
     cameras: tuple[str, ...]
     x_world: NDArray
     covariance: NDArray
@@ -111,11 +103,11 @@ def check_images(rig: Rig, images: Sequence[SplineImage], fewest: int = 2) -> No
 def measure(
     rig: Rig,
     images: Sequence[SplineImage],
-    grid: Grid,
+    grid: matching.Grid,
     *,
-    seeds: Sequence[Seeds] | None = None,
-    window: int | ArrayLike = WINDOW,
-    least: float = MIN_CORRELATION,
+    seeds: Sequence[matching.Seeds] | None = None,
+    window: int | ArrayLike = matching.WINDOW,
+    least: float = matching.MIN_CORRELATION,
     constrained: bool | None = None,
 ) -> MeasuredSurface:
     """Measure a surface from the images of two or more cameras at one time.
@@ -138,13 +130,13 @@ def measure(
     """
     check_images(rig, images)
     first = images[0]
-    half_sides(window, len(grid.points))
+    matching.half_sides(window, len(grid.points))
     if seeds is not None and len(seeds) != len(rig) - 1:
         raise ObservationError(f"seeds of {len(seeds)} cameras", remedy=f"Give those of the other {len(rig) - 1}.")
     found = []
     for k, (camera, image) in enumerate(zip(rig.cameras[1:], images[1:])):
         if seeds is not None:
-            found.append(grow(first, image, grid, seeds[k], window=window, least=least))
+            found.append(matching.grow(first, image, grid, seeds[k], window=window, least=least))
         else:
             found.append(grow_between(first, image, (rig.cameras[0], camera), grid, window=window, least=least))
         if found[-1].found.sum() < _MIN_POINTS:
@@ -179,7 +171,7 @@ def _raise_unmatched(first: SplineImage, camera: str) -> None:
     raise ObservationError(problem, place=f"camera {camera}", remedy=remedy)
 
 
-def reject_repeated_texture(first: SplineImage, second: SplineImage, found: Matches, place: str) -> None:
+def reject_repeated_texture(first: SplineImage, second: SplineImage, found: matching.Matches, place: str) -> None:
     """Raise an error if the texture repeats nearby, so that matches are ambiguous.
 
     Windows of 31 px around 20 points are searched within two windows of their matches. The texture repeats if most of
@@ -201,7 +193,9 @@ def reject_repeated_texture(first: SplineImage, second: SplineImage, found: Matc
         raise ObservationError(problem, place=place, remedy="Give seeds by hand, or use another texture.")
 
 
-def from_matches(rig: Rig, grid: Grid, own: Matches | None, others: Sequence[Matches]) -> MeasuredSurface:
+def from_matches(
+    rig: Rig, grid: matching.Grid, own: matching.Matches | None, others: Sequence[matching.Matches]
+) -> MeasuredSurface:
     """Intersect the matches of a grid and reject those with an outlying parallax.
 
     Parameters
@@ -240,10 +234,10 @@ def match_rays(
     rig: Rig,
     images: Sequence[SplineImage],
     surface: MeasuredSurface,
-    found: Sequence[Matches],
+    found: Sequence[matching.Matches],
     *,
-    window: int | ArrayLike = WINDOW,
-    least: float = MIN_CORRELATION,
+    window: int | ArrayLike = matching.WINDOW,
+    least: float = matching.MIN_CORRELATION,
 ) -> MeasuredSurface:
     """Match all images of a surface jointly along the first camera's rays, starting at the measured points.
 
@@ -283,11 +277,11 @@ Progress = Callable[[str, int, int], None]
 def measure_states(
     rig: Rig,
     states: Sequence[Sequence[SplineImage]],
-    grid: Grid,
+    grid: matching.Grid,
     *,
-    seeds: Sequence[Seeds] | None = None,
-    window: int | ArrayLike = WINDOW,
-    least: float = MIN_CORRELATION,
+    seeds: Sequence[matching.Seeds] | None = None,
+    window: int | ArrayLike = matching.WINDOW,
+    least: float = matching.MIN_CORRELATION,
     incremental: bool = False,
     progress: Progress | None = None,
 ) -> list[MeasuredSurface]:
@@ -323,7 +317,7 @@ def measure_states(
         images = states[k]
         check_images(rig, images)
         own_matches = grow_over_time(template, images[0], places, window=window, least=least)
-        current_grid, others = replace(places, points=own_matches.uv), list[Matches]()
+        current_grid, others = replace(places, points=own_matches.uv), list[matching.Matches]()
         for image, camera in zip(images[1:], rig.cameras[1:]):
             pair = rig.cameras[0], camera
             if incremental:
@@ -390,11 +384,11 @@ def rigid_motion(reference: NDArray, state: NDArray) -> tuple[NDArray, NDArray]:
 
 def measure_flat(
     states: Sequence[SplineImage],
-    grid: Grid,
+    grid: matching.Grid,
     pixel: float,
     *,
-    window: int | ArrayLike = WINDOW,
-    least: float = MIN_CORRELATION,
+    window: int | ArrayLike = matching.WINDOW,
+    least: float = matching.MIN_CORRELATION,
     incremental: bool = False,
 ) -> list[MeasuredSurface]:
     """Measure points of a flat surface in several states by one camera whose axis is normal to it.
@@ -443,7 +437,7 @@ def measure_flat(
     return out
 
 
-def _surface(grid: Grid, found: Matches | None, pixel: float) -> MeasuredSurface:
+def _surface(grid: matching.Grid, found: matching.Matches | None, pixel: float) -> MeasuredSurface:
     """The surface of the first image, or of the matches in a later one."""
     uv: NDArray = grid.points if found is None else found.uv
     exact = np.where(grid.inside[:, None, None], _EXACT_VARIANCE * np.eye(2), np.nan)
