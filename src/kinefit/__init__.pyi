@@ -38,7 +38,7 @@ from kinefit.sensors.settings import TrackSettings as TrackSettings
 from kinefit.fitting.smoothing.online.fixed_lag import FixedLag as FixedLag
 from kinefit.fitting.smoothing.online.fixed_lag import KnownNoise as KnownNoise
 from kinefit.fitting.subject.fit import fit_subject as fit_subject
-from kinefit.fitting.subject.sensor_parameters import OwnUnknowns as OwnUnknowns
+from kinefit.fitting.subject.subject import OwnUnknowns as OwnUnknowns
 from kinefit.fitting.tracking.recording import Recording as Recording
 from kinefit.takes.track import track_take as track_take
 from kinefit.fitting.tracking.tracker import Tracker as Tracker

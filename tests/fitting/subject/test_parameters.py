@@ -21,7 +21,7 @@ from kinefit.fitting.subject.parameters import (
     place_spread,
     stacked,
 )
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics, OwnUnknowns
+from kinefit.fitting.subject.subject import CameraExtrinsics, OwnUnknowns
 from kinefit.geometry import se3
 from kinefit.geometry.losses import geman_mcclure
 from kinefit.sensors.base import RowsOf, Unknown

@@ -31,8 +31,7 @@ from kinefit.fitting.smoothing.process_noise import DETECTOR_CORRELATION_TIME, S
 from kinefit.fitting.smoothing.spool import Spool
 from kinefit.fitting.subject.fit import CLOSURES, Worlds
 from kinefit.fitting.subject.parameters import PointOffsets, World, stacked
-from kinefit.fitting.subject.sensor_parameters import OwnUnknowns
-from kinefit.fitting.subject.subject import SubjectFit
+from kinefit.fitting.subject.subject import OwnUnknowns, SubjectFit
 from kinefit.fitting.subject.surfaces import CylinderShape, Girths
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.base import Matched, rows_at

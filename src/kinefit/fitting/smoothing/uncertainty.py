@@ -31,8 +31,7 @@ from kinefit.fitting.smoothing.shared_errors import SharedErrors
 from kinefit.fitting.smoothing.spool import stretches
 from kinefit.fitting.subject.fit import closing_moves, point_moves
 from kinefit.fitting.subject.point_moves import ClosureMoves, PointMoves
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics, same_cameras
-from kinefit.fitting.subject.subject import Subject, SubjectFit
+from kinefit.fitting.subject.subject import CameraExtrinsics, Subject, SubjectFit, same_cameras
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.points.keypoints import Layout
 from kinefit.sensors.settings import CameraErrors

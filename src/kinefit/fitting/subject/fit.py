@@ -20,8 +20,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.fitting.subject.parameters import FrameRows, Parameters, World, excess, stacked
 from kinefit.fitting.subject.point_moves import ClosureMoves, PointMoves, closing_rows
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics
-from kinefit.fitting.subject.subject import Progress, SubjectFit
+from kinefit.fitting.subject.subject import CameraExtrinsics, Progress, SubjectFit
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.losses import SQUARED, Loss
 from kinefit.sensors.base import Matched, Measurement, matched_by, packed, rows_at

@@ -14,8 +14,7 @@ from kinefit.fitting.initialization.from_points import first_scales, pose_from_p
 from kinefit.fitting.subject import fit as joint
 from kinefit.fitting.subject import parameters as kinds
 from kinefit.fitting.subject.fit import MatchedFrames, Worlds
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics
-from kinefit.fitting.subject.subject import Progress, Subject, SubjectFit
+from kinefit.fitting.subject.subject import CameraExtrinsics, Progress, Subject, SubjectFit
 from kinefit.fitting.subject.view_bias import SeenFrames, learn_view_bias
 from kinefit.geometry.losses import geman_mcclure
 from kinefit.observations import KEYPOINTS

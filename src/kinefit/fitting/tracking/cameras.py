@@ -15,8 +15,14 @@ from numpy.typing import NDArray
 from kinefit.bodies import BodyState
 from kinefit.bodies.motion import Residuals
 from kinefit.fitting.frame.routing import Sensors
-from kinefit.fitting.subject.sensor_parameters import OUTLIER_SIGMAS, CameraExtrinsics, SensorFrames, moved_rig
-from kinefit.fitting.subject.subject import Subject, SubjectFit
+from kinefit.fitting.subject.subject import (
+    OUTLIER_SIGMAS,
+    CameraExtrinsics,
+    SensorFrames,
+    Subject,
+    SubjectFit,
+    moved_rig,
+)
 from kinefit.fitting.tracking.recording import Recording, spread
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig

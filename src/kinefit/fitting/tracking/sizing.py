@@ -22,8 +22,7 @@ from kinefit.fitting.subject import fit as joint
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.subject.metaballs import ROUNDS, MetaballShape
 from kinefit.fitting.subject.parameters import Gear, SegmentScales
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics, moved_rig
-from kinefit.fitting.subject.subject import Progress, Subject, SubjectFit
+from kinefit.fitting.subject.subject import CameraExtrinsics, Progress, Subject, SubjectFit, moved_rig
 from kinefit.fitting.tracking.cameras import CAMERAS, LEFT_OUT, between, composed, placed_cameras
 from kinefit.fitting.tracking.recording import Recording, spread
 from kinefit.fitting.tracking.recovery import is_rare

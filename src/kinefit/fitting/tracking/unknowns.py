@@ -12,8 +12,7 @@ from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.fitting.multiview.followed import only_lifted
 from kinefit.fitting.subject import parameters as kinds
 from kinefit.fitting.subject.fit import REACH, MatchedFrames, Worlds
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics, OwnUnknowns
-from kinefit.fitting.subject.subject import Subject, SubjectFit
+from kinefit.fitting.subject.subject import CameraExtrinsics, OwnUnknowns, Subject, SubjectFit
 from kinefit.fitting.subject.surfaces import shape_of
 from kinefit.fitting.tracking.recording import Recording
 from kinefit.geometry.camera import Rig
