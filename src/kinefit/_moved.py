@@ -19,6 +19,7 @@ MOVED_PATHS = {
     "evaluation": "simulation.evaluation", "fitting.frame.minimum": "fitting.frame.fit",
     "fitting.frame.trust": "fitting.frame.results",
     "fitting.initialization.from_clicks": "fitting.initialization.from_points",
+    "fitting.initialization.from_silhouettes": "fitting.initialization.candidates",
     "fitting.markers.poses": "fitting.markers.subject", "fitting.multiview.boxes": "fitting.multiview.association",
     "fitting.multiview.mirrors": "fitting.multiview.followed", "fitting.multiview.turned": "fitting.multiview.views",
     "fitting.smoothing.online.lag_frame": "fitting.smoothing.online.fixed_lag",
