@@ -47,7 +47,7 @@ MOVED_PATHS = {
     "readers.keypoint_sets": "readers.landmarks.keypoint_sets", "readers.keypoints": "readers.landmarks.keypoints",
     "readers.sound": "readers.videos.sound", "readers.video": "readers.videos.video",
     "readers.video_files": "readers.videos.video_files", "recipes": "papers", "rendering": "bodies.rendering",
-    "rigs.bar.placing": "rigs.bar.start", "rigs.bar.report": "rigs.bar.calibrate",
+    "rigs.bar.placing": "rigs.bar.start", "rigs.bar.report": "rigs.bar.calibrate", "rigs.bar.table": "rigs.bar.targets",
     "rigs.board.intrinsics": "rigs.board.extrinsics", "rigs.refine.sightings": "rigs.refine.result",
     "rows": "solving.rows", "serving": "studio.serving", "simulation.replay": "simulation.figures",
     "smoothing": "fitting.smoothing", "solvers": "solving", "solvers.sequence": "solving.trajectory.sequence",
