@@ -20,8 +20,7 @@ from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.rigs.people.first_rig import first_rig
 from kinefit.rigs.people.floor import settled
 from kinefit.rigs.people.skeletons import first_cameras, in_step, steady_person
-from kinefit.rigs.refine.gauge import resized
-from kinefit.rigs.refine.refine import Length, check_input, length_of, prior_sigma, refine_from
+from kinefit.rigs.refine.refine import Length, check_input, length_of, prior_sigma, refine_from, resized
 from kinefit.rigs.refine.result import PersonSighting, PersonTrial, Progress, Refinement
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solving.bundle.adjust import BundleState, adjust
