@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._arguments import checked, shaped
 from kinefit.markers.frame._kernels_evidence import place_joint
 from kinefit.markers.frame._kernels_posture import turn_costs
-from kinefit.markers.frame.beliefs import Beliefs, Identification
 from kinefit.markers.frame.explain import (
     MAX_RIVAL_COST,
     Solution,
@@ -27,7 +26,7 @@ from kinefit.markers.frame.explain import (
     solution,
 )
 from kinefit.markers.frame.search import LabelSearch, UnlabelledFrame
-from kinefit.markers.frame.tables import segment_tables
+from kinefit.markers.frame.tables import Beliefs, Identification, segment_tables
 from kinefit.markers.model.model import MarkerModel
 
 OUTLIER_SHARE = 0.05

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.markers.frame.beliefs import Beliefs, Identification, learn_beliefs
+from kinefit.markers.frame.tables import Beliefs, Identification, learn_beliefs
 from kinefit.markers.model.model import MarkerModel
 from kinefit.markers.take._kernels_tracks import link_points
 from kinefit.markers.take.consistency import Consistency
