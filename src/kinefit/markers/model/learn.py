@@ -19,7 +19,7 @@ from kinefit.markers.model.clusters import learn_segments
 from kinefit.markers.model.model import MarkerJoint, MarkerModel
 from kinefit.markers.model.rigid import exercised_share, fit_joint, joint_ranges, reference_turn
 from kinefit.observations import Markers
-from kinefit.solving.rigid_clusters import nan_median, rigid_frames
+from kinefit.solving.functional_joints import nan_median, rigid_frames
 
 MAX_FRAMES = 1000
 """Frames used, spread over the take: consecutive frames are alike."""
