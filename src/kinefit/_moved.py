@@ -61,7 +61,8 @@ MOVED_PATHS = {
     "solving.pixels": "solving.least_squares", "solving.rigid_clusters": "solving.functional_joints",
     "solving.trajectory._kernels_sequence": "solving.trajectory._kernels_smoothing",
     "solving.trajectory._kernels_shared": "solving.trajectory._kernels_smoothing",
-    "solving.trajectory.marginal": "solving.trajectory.smoothing", "subject": "fitting.subject",
+    "solving.trajectory.marginal": "solving.trajectory.smoothing",
+    "solving.trajectory.seen_points": "solving.trajectory.sequence", "subject": "fitting.subject",
     "tracking": "fitting.tracking", "viewers": "studio.viewers",
 }  # fmt: skip
 """{path below `kinefit` in 0.2: path now}; what lies below a path moved with it."""
