@@ -56,6 +56,7 @@ MOVED_PATHS = {
     "simulation.replay": "simulation.figures", "smoothing": "fitting.smoothing", "solvers": "solving",
     "solvers.sequence": "solving.trajectory.sequence", "solving.bundle.body_bundle": "solving.bundle.shape",
     "solving.correspondences.anchored": "solving.correspondences.surfaces",
+    "solving.correspondences.bands": "solving.correspondences.closures",
     "solving.correspondences.contours.rims": "solving.correspondences.contours.outlines",
     "solving.correspondences.occupancy.depth_image": "solving.correspondences.occupancy.free_space",
     "solving.pixels": "solving.least_squares", "solving.rigid_clusters": "solving.functional_joints",

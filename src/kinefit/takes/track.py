@@ -38,7 +38,7 @@ from kinefit.readers.take.load import Observations, load_observations
 from kinefit.rigs.diagnostics.images import load_uncovered
 from kinefit.rigs.diagnostics.quick import input_findings, with_cause, with_findings
 from kinefit.sensors.settings import TrackSettings
-from kinefit.solving.correspondences.bands import BAND, with_bands
+from kinefit.solving.correspondences.closures import BAND, with_bands
 from kinefit.takes.in_view import InView, people_in_view
 from kinefit.takes.missing import prepared
 

@@ -1,7 +1,6 @@
 """Row makers: observations and a body at a state to linearised measurements, one file for each kind."""
 
-from kinefit.solving.correspondences.bands import Bands, band_rows, coincidence_rows, joint_bands
-from kinefit.solving.correspondences.closures import closure_rows
+from kinefit.solving.correspondences.closures import Bands, band_rows, closure_rows, coincidence_rows, joint_bands
 from kinefit.solving.correspondences.contours.morphed import morphed_outline_rows, morphed_rows
 from kinefit.solving.correspondences.contours.outlines import outline_pairs, outline_rows
 from kinefit.solving.correspondences.occupancy.collisions import collision_rows
