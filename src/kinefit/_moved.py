@@ -58,6 +58,7 @@ MOVED_PATHS = {
     "solving.correspondences.anchored": "solving.correspondences.surfaces",
     "solving.correspondences.bands": "solving.correspondences.closures",
     "solving.correspondences.contours.rims": "solving.correspondences.contours.outlines",
+    "solving.correspondences.occupancy.collisions": "solving.correspondences.occupancy.free_space",
     "solving.correspondences.occupancy.depth_image": "solving.correspondences.occupancy.free_space",
     "solving.pixels": "solving.least_squares", "solving.rigid_clusters": "solving.functional_joints",
     "solving.trajectory._kernels_sequence": "solving.trajectory._kernels_smoothing",

@@ -54,8 +54,7 @@ from kinefit.solving.correspondences import (
     target_rows,
 )
 from kinefit.solving.correspondences.contours.outlines import Rim
-from kinefit.solving.correspondences.occupancy.collisions import CollisionPairs
-from kinefit.solving.correspondences.occupancy.free_space import FreeSpace, SurfaceSamples
+from kinefit.solving.correspondences.occupancy.free_space import CollisionPairs, FreeSpace, SurfaceSamples
 
 LENSES = (("radtan", (-0.1, 0.05, 0.001, -0.002, 0.01)), ("radtan", ()), ("fisheye", (0.02, -0.01, 0.003, -0.001)))
 

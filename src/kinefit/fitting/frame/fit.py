@@ -22,7 +22,7 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solving.closed import Constraint, closed_fit, closed_step, on_null_space
 from kinefit.solving.correspondences.closures import HARD_SIGMA, closed_at, hard_equations, looped, soft_closures
-from kinefit.solving.correspondences.occupancy.collisions import CollisionPairs, collision_pairs, collision_rows
+from kinefit.solving.correspondences.occupancy.free_space import CollisionPairs, collision_pairs, collision_rows
 from kinefit.solving.correspondences.points import prior_rows
 from kinefit.solving.equations import inverse, joint_moves, normal_equations
 from kinefit.solving.least_squares import INITIAL_DAMPING, fit_pixels, gauss_newton, levenberg_marquardt

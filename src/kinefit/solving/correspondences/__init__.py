@@ -3,8 +3,7 @@
 from kinefit.solving.correspondences.closures import Bands, band_rows, closure_rows, coincidence_rows, joint_bands
 from kinefit.solving.correspondences.contours.morphed import morphed_outline_rows, morphed_rows
 from kinefit.solving.correspondences.contours.outlines import outline_pairs, outline_rows
-from kinefit.solving.correspondences.occupancy.collisions import collision_rows
-from kinefit.solving.correspondences.occupancy.free_space import depth_image_rows, free_space_rows
+from kinefit.solving.correspondences.occupancy.free_space import collision_rows, depth_image_rows, free_space_rows
 from kinefit.solving.correspondences.points import (
     edge_rows,
     image_line_rows,
