@@ -13,6 +13,7 @@ MOVED_PATHS = {
     "app": "studio.app", "assets": "readers.assets", "batch": "takes.batch", "batch.viewed": "studio.viewers.viewed",
     "bodies.anny": "bodies.morphs.anny", "bodies.body_surfaces": "bodies.surfaces.places",
     "bodies.closures": "bodies.tree", "bodies.joint_names": "bodies.toml.joint_names",
+    "bodies.surfaces.places.meshes": "bodies.surfaces.places.anchors",
     "bodies.surfaces.places.nearest": "bodies.surfaces.places.anchors",
     "bodies.surfaces.triangles": "bodies.surfaces.mesh", "calibration": "rigs",
     "correspondences": "solving.correspondences", "diagnostics": "rigs.diagnostics",
