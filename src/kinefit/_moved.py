@@ -19,7 +19,7 @@ MOVED_PATHS = {
     "correspondences": "solving.correspondences", "diagnostics": "rigs.diagnostics",
     "diagnostics.sensors": "sensors.alignment", "diagnostics.views": "fitting.multiview.views",
     "evaluation": "simulation.evaluation", "fitting.frame.minimum": "fitting.frame.fit",
-    "fitting.frame.prediction": "fitting.frame.fit", "fitting.frame.trust": "fitting.frame.results",
+    "fitting.frame.trust": "fitting.frame.results",
     "fitting.initialization.from_clicks": "fitting.initialization.from_points",
     "fitting.initialization.from_silhouettes": "fitting.initialization.candidates",
     "fitting.markers.poses": "fitting.markers.subject", "fitting.multiview.boxes": "fitting.multiview.association",

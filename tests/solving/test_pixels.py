@@ -7,7 +7,7 @@ import pytest
 from tests.oracle import posture
 
 from kinefit.bodies import load_body
-from kinefit.fitting.frame.fit import prediction_row
+from kinefit.fitting.frame.prediction import prediction_row
 from kinefit.geometry.losses import SQUARED, geman_mcclure, huber
 from kinefit.simulation import squat_and_wave, studio_rig
 from kinefit.solving.correspondences.points import pixel_rows, prior_rows

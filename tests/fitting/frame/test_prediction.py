@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.fitting.frame.fit import Prediction, marginal_information, prediction_row
+from kinefit.fitting.frame.prediction import Prediction, marginal_information, prediction_row
 from kinefit.solving.equations import normal_equations
 from kinefit.solving.rows import ParameterRows
 

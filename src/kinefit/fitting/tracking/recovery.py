@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.limbs import limbs
-from kinefit.fitting.frame.fit import Fitted, marginal_information
+from kinefit.fitting.frame.fit import Fitted
+from kinefit.fitting.frame.prediction import marginal_information
 from kinefit.fitting.frame.results import ROOT_PRIOR_STD, FrameResult, evidence_of, sum_evidence
 from kinefit.fitting.frame.routing import Sensors
 from kinefit.fitting.initialization import candidates

@@ -16,7 +16,8 @@ from kinefit.bodies.motion import Motion
 from kinefit.bodies.parts import carry_dofs, carry_state
 from kinefit.bodies.tree import off_the_limits
 from kinefit.errors import BodyError, ObservationError, choices
-from kinefit.fitting.frame.fit import Fitted, FrameFit, Prediction
+from kinefit.fitting.frame.fit import Fitted, FrameFit
+from kinefit.fitting.frame.prediction import Prediction
 from kinefit.fitting.frame.results import FrameResult
 from kinefit.fitting.frame.routing import Sensors, time_of
 from kinefit.fitting.subject.subject import Subject
