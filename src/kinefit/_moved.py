@@ -30,7 +30,6 @@ MOVED_PATHS = {
     "fitting.smoothing.windows": "fitting.smoothing.border", "fitting.subject.gear": "fitting.subject.parameters",
     "fitting.subject.matched_frames": "fitting.subject.fit",
     "fitting.subject.sensor_parameters": "fitting.subject.subject",
-    "fitting.subject.view_bias": "fitting.subject.depth",
     "fitting.tracking.checkpoints.frame_file": "fitting.tracking.checkpoints.checkpoint",
     "fitting.tracking.marker_steps": "fitting.tracking.run", "fitting.tracking.markers": "fitting.tracking.video",
     "fitting.tracking.placing": "fitting.tracking.cameras", "fitting.tracking.session": "fitting.tracking.motions",

@@ -13,9 +13,9 @@ from kinefit.errors import TrackingError
 from kinefit.fitting.initialization.from_points import first_scales, pose_from_points
 from kinefit.fitting.subject import fit as joint
 from kinefit.fitting.subject import parameters as kinds
-from kinefit.fitting.subject.depth import SeenFrames, learn_view_bias
 from kinefit.fitting.subject.fit import MatchedFrames, Worlds
 from kinefit.fitting.subject.subject import CameraExtrinsics, Progress, Subject, SubjectFit
+from kinefit.fitting.subject.view_bias import SeenFrames, learn_view_bias
 from kinefit.geometry.losses import geman_mcclure
 from kinefit.observations import KEYPOINTS
 from kinefit.sensors.channels import Channels, fitted_pixels
