@@ -52,7 +52,7 @@ MOVED_PATHS = {
     "rigs.bar.table": "rigs.bar.targets", "rigs.board.bundle": "rigs.board.calibrate",
     "rigs.board.intrinsics": "rigs.board.extrinsics", "rigs.diagnostics.depth": "rigs.diagnostics.person",
     "rigs.diagnostics.frozen": "rigs.diagnostics.images", "rigs.people.first_rig": "rigs.people.calibrate",
-    "rigs.people.floor": "rigs.people.calibrate", "rigs.refine.gauge": "rigs.refine.refine",
+    "rigs.people.floor": "rigs.people.calibrate",
     "rigs.refine.sightings": "rigs.refine.result", "rows": "solving.rows", "serving": "studio.serving",
     "simulation.replay": "simulation.figures", "smoothing": "fitting.smoothing", "solvers": "solving",
     "solvers.sequence": "solving.trajectory.sequence", "solving.bundle.body_bundle": "solving.bundle.shape",

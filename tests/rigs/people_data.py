@@ -40,7 +40,7 @@ def seen(cameras=4, seed=0):
 
 def errors(found, truth):
     """Largest rotation [deg] and position [mm] error of a camera, the rig as a whole laid on the true one."""
-    from kinefit.rigs.refine.refine import aligned
+    from kinefit.rigs.refine.gauge import aligned
 
     rig = aligned(found, truth)[0]
     turns = [

@@ -32,7 +32,8 @@ from kinefit.geometry import se3
 from kinefit.geometry.lines import triangulate
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.rigs.people.calibrate import calibrate_people
-from kinefit.rigs.refine.refine import aligned, refine
+from kinefit.rigs.refine.gauge import aligned
+from kinefit.rigs.refine.refine import refine
 from kinefit.rigs.refine.result import Refinement
 from kinefit.simulation import cut, simulate_keypoints, studio_rig
 

@@ -30,7 +30,7 @@ def test_poses_come_from_nothing(found):
 
 
 def test_the_floor_is_level_and_the_scale_right(found):
-    from kinefit.rigs.refine.refine import aligned
+    from kinefit.rigs.refine.gauge import aligned
 
     _, T, factor = aligned(found.rig, room())
     assert np.degrees(np.arccos(T[2, 2])) < 4.0

@@ -9,7 +9,8 @@ from tests.rigs.people_data import BODY, errors, room, seen, walker
 from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.rigs.refine.refine import aligned, covariance_in_gauge, generators, refine, resized
+from kinefit.rigs.refine.gauge import aligned, covariance_in_gauge, generators, resized
+from kinefit.rigs.refine.refine import refine
 from kinefit.rigs.refine.result import PersonTrial, correlation_time, residual_correlation, shifted, sight
 from kinefit.simulation import simulate_keypoints
 from kinefit.solving.bundle.cameras import COLUMNS, camera_jacobian, moved_rig

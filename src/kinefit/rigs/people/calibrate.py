@@ -26,7 +26,8 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.lines import triangulate, triangulate_robust
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.rigs.people.skeletons import first_cameras, in_step, steady_person
-from kinefit.rigs.refine.refine import Length, check_input, length_of, prior_sigma, refine_from, resized
+from kinefit.rigs.refine.gauge import resized
+from kinefit.rigs.refine.refine import Length, check_input, length_of, prior_sigma, refine_from
 from kinefit.rigs.refine.result import PersonSighting, PersonTrial, Progress, Refinement
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solving.bundle.adjust import BundleState, adjust

@@ -21,7 +21,7 @@ from kinefit.fitting.tracking.recording import Recording
 from kinefit.fitting.tracking.video import track
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Keypoints
-from kinefit.rigs.refine.refine import aligned, covariance_in_gauge
+from kinefit.rigs.refine.gauge import aligned, covariance_in_gauge
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solving.bundle.adjust import Bundle, BundleState, adjust
 from kinefit.solving.bundle.cameras import COLUMNS, FOCAL, TIME, PointPixels, camera_jacobian, departure
