@@ -49,7 +49,7 @@ MOVED_PATHS = {
     "readers.keypoints": "readers.landmarks.keypoints", "readers.sound": "readers.videos.sound",
     "readers.video": "readers.videos.video", "readers.video_files": "readers.videos.video_files", "recipes": "papers",
     "rendering": "bodies.rendering", "rigs.bar.placing": "rigs.bar.start", "rigs.bar.report": "rigs.bar.calibrate",
-    "rigs.bar.table": "rigs.bar.targets", "rigs.board.bundle": "rigs.board.calibrate",
+    "rigs.bar.table": "rigs.bar.targets",
     "rigs.board.intrinsics": "rigs.board.extrinsics", "rigs.diagnostics.depth": "rigs.diagnostics.person",
     "rigs.diagnostics.frozen": "rigs.diagnostics.images", "rigs.people.first_rig": "rigs.people.calibrate",
     "rigs.people.floor": "rigs.people.calibrate",

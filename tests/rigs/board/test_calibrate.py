@@ -10,7 +10,8 @@ from kinefit.errors import CalibrationError, FileError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.readers.calibration.read import read_calibration
-from kinefit.rigs.board.calibrate import BoardProblem, Corners, adjust_boards, calibrate_board
+from kinefit.rigs.board.bundle import BoardProblem, Corners, adjust_boards
+from kinefit.rigs.board.calibrate import calibrate_board
 from kinefit.rigs.board.detection import Board, BoardView, CameraViews, Finder, fitting_boards, with_dictionary
 from kinefit.rigs.board.extrinsics import calibrate_interiors, place_cameras
 from kinefit.rigs.board.sources import camera_sources, find_boards

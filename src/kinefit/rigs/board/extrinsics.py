@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kinefit.errors import CalibrationError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import inverse, transform
-from kinefit.rigs.board.calibrate import Corners
+from kinefit.rigs.board.bundle import Corners
 from kinefit.rigs.board.detection import Board, BoardView, CameraViews
 
 _MAX_AMBIGUITY_RATIO = 3.0  # of the errors of a flat board's two poses; with more the second is discarded
