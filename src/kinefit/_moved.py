@@ -35,7 +35,6 @@ MOVED_PATHS = {
     "fitting.tracking.placing": "fitting.tracking.cameras", "fitting.tracking.session": "fitting.tracking.motions",
     "frame": "fitting.frame", "identification": "markers",
     "images.photogrammetry.flat": "images.photogrammetry.surface",
-    "images.photogrammetry.matching._kernels_spline": "images.photogrammetry.matching._kernels_matching",
     "images.photogrammetry.region_growing": "images.photogrammetry.least_squares_matching",
     "images.photogrammetry.states": "images.photogrammetry.surface", "initialization": "fitting.initialization",
     "lasting_errors": "bodies.lasting_errors", "live": "studio.live", "losses": "geometry.losses",
@@ -49,10 +48,9 @@ MOVED_PATHS = {
     "readers.keypoints": "readers.landmarks.keypoints", "readers.sound": "readers.videos.sound",
     "readers.video": "readers.videos.video", "readers.video_files": "readers.videos.video_files", "recipes": "papers",
     "rendering": "bodies.rendering", "rigs.bar.placing": "rigs.bar.start", "rigs.bar.report": "rigs.bar.calibrate",
-    "rigs.bar.table": "rigs.bar.targets",
-    "rigs.board.intrinsics": "rigs.board.extrinsics", "rigs.diagnostics.depth": "rigs.diagnostics.person",
-    "rigs.diagnostics.frozen": "rigs.diagnostics.images", "rigs.people.first_rig": "rigs.people.calibrate",
-    "rigs.people.floor": "rigs.people.calibrate",
+    "rigs.bar.table": "rigs.bar.targets", "rigs.board.intrinsics": "rigs.board.extrinsics",
+    "rigs.diagnostics.depth": "rigs.diagnostics.person", "rigs.diagnostics.frozen": "rigs.diagnostics.images",
+    "rigs.people.first_rig": "rigs.people.calibrate", "rigs.people.floor": "rigs.people.calibrate",
     "rigs.refine.sightings": "rigs.refine.result", "rows": "solving.rows", "serving": "studio.serving",
     "simulation.replay": "simulation.figures", "smoothing": "fitting.smoothing", "solvers": "solving",
     "solvers.sequence": "solving.trajectory.sequence", "solving.bundle.body_bundle": "solving.bundle.shape",
@@ -62,13 +60,11 @@ MOVED_PATHS = {
     "solving.correspondences.occupancy.collisions": "solving.correspondences.occupancy.free_space",
     "solving.correspondences.occupancy.depth_image": "solving.correspondences.occupancy.free_space",
     "solving.pixels": "solving.least_squares", "solving.rigid_clusters": "solving.functional_joints",
-    "solving.trajectory._kernels_sequence": "solving.trajectory._kernels_smoothing",
-    "solving.trajectory._kernels_shared": "solving.trajectory._kernels_smoothing",
     "solving.trajectory.marginal": "solving.trajectory.smoothing",
     "solving.trajectory.seen_points": "solving.trajectory.sequence", "subject": "fitting.subject",
     "tracking": "fitting.tracking", "viewers": "studio.viewers",
 }  # fmt: skip
-"""{path below `kinefit` in 0.2: path now}; what lies below a path moved with it."""
+"""{path below `kinefit` in 0.2 or since: path now}; what lies below a path moved with it."""
 
 
 def moved(old: str) -> str:
