@@ -340,7 +340,7 @@ def fit_subject(
     rounds : of match and solve, at most; fewer if correspondences no longer change
     looks : float, optional
         Number of frames with independent errors that all frames together count as; default: estimated for each sensor
-        from the bias of its residuals (see `excess.excess`).
+        from the bias of its residuals (see `parameters.excess`).
     loss : Loss of rows that have none of their own
     posture : share of the body's posture prior that constrains the poses
     coarse : iterations of a round whose correspondences still change, and steps of the poses alone in each. Few

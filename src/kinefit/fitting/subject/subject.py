@@ -355,7 +355,7 @@ class SubjectFit:
     information : (p, p) of the sensors without the prior, deflated by an excess above 1
     prior : Prior
     excess : {sensor: factor} by which the variance of all its frames together exceeds that of its rows, see
-        `excess.excess`
+        `parameters.excess`
     cost : float
     rounds : of match and solve
     parameters : kinds of parameters
