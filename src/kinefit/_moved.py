@@ -59,7 +59,7 @@ MOVED_PATHS = {
     "solving.correspondences.contours.rims": "solving.correspondences.contours.outlines",
     "solving.correspondences.occupancy.collisions": "solving.correspondences.occupancy.free_space",
     "solving.correspondences.occupancy.depth_image": "solving.correspondences.occupancy.free_space",
-    "solving.pixels": "solving.least_squares", "solving.rigid_clusters": "solving.functional_joints",
+    "solving.rigid_clusters": "solving.functional_joints",
     "solving.trajectory.marginal": "solving.trajectory.smoothing",
     "solving.trajectory.seen_points": "solving.trajectory.sequence", "subject": "fitting.subject",
     "tracking": "fitting.tracking", "viewers": "studio.viewers",

@@ -16,7 +16,8 @@ from kinefit.geometry.losses import SQUARED, Loss
 from kinefit.solving import _kernels_border, _kernels_linear
 from kinefit.solving.bundle.arrow import MIN_DIAGONAL_RATIO
 from kinefit.solving.equations import columns, dense_pattern, lock, normal_equations, residuals, robust_factors
-from kinefit.solving.least_squares import bounds_of, descend, fit_pixels
+from kinefit.solving.least_squares import bounds_of, descend
+from kinefit.solving.pixels import fit_pixels
 from kinefit.solving.rows import AnyRows, DofRows, Rows
 
 POSTURE_SHARE = 0.01
