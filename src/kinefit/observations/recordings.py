@@ -190,8 +190,9 @@ class Keypoints:
 
     def _changed(self, change: Callable[[NDArray], NDArray], **fields: Any) -> Keypoints:
         """The record with each of its arrays of points (F, P, K, ...) changed, and other fields."""
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in ("points", "confidence", "lifted")}
-        return replace(self, **{n: change(a) for n, a in arrays.items() if a is not None}, **fields)
+        arrays = {name: getattr(self, name) for name in ("points", "confidence", "lifted")}
+        changed: dict[str, Any] = {name: change(a) for name, a in arrays.items() if a is not None}
+        return replace(self, **changed, **fields)
 
     def of_one(self, chosen: NDArray) -> Keypoints:
         """The keypoints of one person; chosen (F,) int is the person's number in each frame, -1 for none."""

@@ -58,12 +58,13 @@ class Unknowns:
         moved = found.mean - found.prior.mean
         for k, (one, before) in enumerate(zip(self.parameters, stated.parameters)):
             own = slice(first, first := first + len(one.names))
-            offsets = one if isinstance(one, kinds.PointOffsets) and isinstance(before, kinds.PointOffsets) else None
-            if offsets is not None and offsets.name in offsets.body.marker_sets:
+            if isinstance(one, kinds.PointOffsets) and isinstance(before, kinds.PointOffsets):
+                if one.name not in one.body.marker_sets:
+                    continue
                 std, factor = (1.0 / np.sqrt(np.diag(p.information)) for p in (before, one))
                 ratio = float(np.median(factor / std))
                 wider = kinds.place_spread(found.mean[own] / std, variance[own] / std**2, ratio, 1.0)
-                parameters[k] = replace(offsets, std=wider * np.asarray(before.std))
+                parameters[k] = replace(one, std=wider * np.asarray(before.std))
             elif isinstance(one, CameraExtrinsics):
                 parameters[k] = one.with_errors_of(own, moved, found.information, found.prior.information)
         return replace(self, parameters=tuple(parameters), start=found.mean)
