@@ -15,15 +15,15 @@ from benchmarks.figures import ROOT
 from kinefit.bodies import Body, BodyState, PointSet, load_body
 from kinefit.bodies.rendering import render_body
 from kinefit.bodies.surfaces import MeshSurface, Metaballs
+from kinefit.bodies.surfaces.mesh import BodyMesh
 from kinefit.bodies.surfaces.places import body_mesh, sample
-from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.bodies.tree import KinematicTree
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.papers._colour_densities import COLOURS, DENSITIES, colour_cells
 from kinefit.papers.metaball_bodies import metaball_bodies
 from kinefit.papers.regions import pose_from_regions
-from kinefit.solving.correspondences.contours.rims import RimFinder
+from kinefit.solving.correspondences.contours.outlines import RimFinder
 
 IMAGES = ROOT / "docs" / "images"
 _SCALE = 3  # of the small image of regions

@@ -21,8 +21,7 @@ import kinefit
 from benchmarks.figures import LEFT_OUT, amount, figure, quick
 from benchmarks.speed.long import command, same_results, tracked, write_long_take
 from kinefit.errors import KinefitError
-from kinefit.fitting.tracking.checkpoints.checkpoint import Checkpoint, key_of
-from kinefit.fitting.tracking.checkpoints.frame_file import FORMAT, FRAME, STATE
+from kinefit.fitting.tracking.checkpoints.checkpoint import FORMAT, FRAME, STATE, Checkpoint, key_of
 from kinefit.readers.take.file import Take, read_take
 from kinefit.takes.track import track_take
 

@@ -18,8 +18,8 @@ from kinefit.bodies import Body, load_body
 from kinefit.bodies.marker_sets import find_placement, matched, side_pairs
 from kinefit.errors import KinefitError
 from kinefit.findings import Finding
-from kinefit.fitting.markers.poses import split_people
 from kinefit.fitting.markers.sides import label_findings
+from kinefit.fitting.markers.subject import split_people
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure, recording
 from kinefit import fit_marker_subject, fit_markers, load_body, read_markers
 from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.fitting.markers.poses import columns, sequence_both_ways
+from kinefit.fitting.markers.subject import columns, sequence_both_ways
 from kinefit.geometry.losses import SQUARED
 from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.solving.trajectory.sequence import fit_sequence

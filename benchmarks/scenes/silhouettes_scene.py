@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.surfaces.mesh import MeshSurface
-from kinefit.bodies.surfaces.triangles import triangles
+from kinefit.bodies.surfaces.mesh import MeshSurface, triangles
 from kinefit.fitting.subject.fit import fit_subject
 from kinefit.fitting.subject.parameters import Parameters
 from kinefit.fitting.subject.subject import SubjectFit

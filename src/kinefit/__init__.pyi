@@ -36,9 +36,9 @@ from kinefit.readers.take.file import read_take as read_take
 from kinefit.readers.take.load import load_observations as load_observations
 from kinefit.sensors.settings import TrackSettings as TrackSettings
 from kinefit.fitting.smoothing.online.fixed_lag import FixedLag as FixedLag
-from kinefit.fitting.smoothing.online.lag_frame import KnownNoise as KnownNoise
+from kinefit.fitting.smoothing.online.fixed_lag import KnownNoise as KnownNoise
 from kinefit.fitting.subject.fit import fit_subject as fit_subject
-from kinefit.fitting.subject.sensor_parameters import OwnUnknowns as OwnUnknowns
+from kinefit.fitting.subject.subject import OwnUnknowns as OwnUnknowns
 from kinefit.fitting.tracking.recording import Recording as Recording
 from kinefit.takes.track import track_take as track_take
 from kinefit.fitting.tracking.tracker import Tracker as Tracker
@@ -48,13 +48,13 @@ from kinefit.fitting.tracking.video import track as track
 from kinefit.markers.audit.audit import audit_take as audit_take
 from kinefit.markers.frame.identify import identify as identify
 from kinefit.markers.model.from_frame import model_from_frame as model_from_frame
-from kinefit.markers.model.gate import training_gate as training_gate
+from kinefit.markers.model.learn import training_gate as training_gate
 from kinefit.markers.model.learn import learn_model as learn_model
 from kinefit.markers.take.takes import identify_people as identify_people
 from kinefit.markers.take.takes import identify_take as identify_take
-from kinefit.fitting.markers.poses import split_people as split_people
+from kinefit.fitting.markers.subject import split_people as split_people
 from kinefit.fitting.markers.subject import fit_marker_subject as fit_marker_subject
-from kinefit.fitting.tracking.markers import fit_markers as fit_markers
+from kinefit.fitting.tracking.video import fit_markers as fit_markers
 
 # Calibration, and checks of a recording
 from kinefit.rigs.board.calibrate import calibrate_board as calibrate_board

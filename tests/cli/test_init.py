@@ -125,7 +125,7 @@ def test_one_video_of_a_telephone_can_be_tracked(tmp_path, data_dir):
 
 def clicked(folder, motion, frame=3, names=None):
     """Clicks on the joints of a drawn take, as JSON has them."""
-    from kinefit.fitting.initialization.from_clicks import clickable
+    from kinefit.fitting.initialization.from_points import clickable
 
     body, seen = motion.body, load_observations(read_take(folder / "take.toml"))
     points = body.landmarks.select(names or clickable(body))

@@ -16,7 +16,7 @@ from kinefit.cli import main
 from kinefit.cli.tracking.track import track as command
 from kinefit.errors import KinefitError
 from kinefit.exporters import write_markers, write_motion
-from kinefit.fitting.smoothing.online.lag_frame import KnownNoise
+from kinefit.fitting.smoothing.online.fixed_lag import KnownNoise
 from kinefit.fitting.subject.subject import Subject
 from kinefit.fitting.tracking.recording import Recording
 from kinefit.fitting.tracking.take_recording import recording_of

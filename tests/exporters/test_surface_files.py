@@ -15,7 +15,7 @@ from kinefit.exporters.surface_files import (
     write_points_csv,
     write_surface_vtk,
 )
-from kinefit.images.photogrammetry.region_growing import Grid
+from kinefit.images.photogrammetry.least_squares_matching import Grid
 from kinefit.images.photogrammetry.strain import strain
 from kinefit.images.photogrammetry.surface import MeasuredSurface
 from kinefit.images.photogrammetry.trajectories import Trajectories

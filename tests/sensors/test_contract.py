@@ -30,7 +30,7 @@ from tests.sensors.fakes import (
 from kinefit.errors import ObservationError
 from kinefit.fitting.subject.fit import fit_subject
 from kinefit.fitting.subject.parameters import SegmentScales
-from kinefit.fitting.subject.sensor_parameters import OwnUnknowns
+from kinefit.fitting.subject.subject import OwnUnknowns
 from kinefit.fitting.tracking.recording import Recording
 from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.fitting.tracking.video import track

@@ -6,7 +6,7 @@ import pytest
 from kinefit.bodies import load_body
 from kinefit.errors import ObservationError
 from kinefit.fitting.subject.fit import fit_subject
-from kinefit.fitting.subject.sensor_parameters import SensorFrames
+from kinefit.fitting.subject.subject import SensorFrames
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.losses import SQUARED

@@ -9,9 +9,8 @@ from kinefit.cli import main
 from kinefit.errors import ExportError, ObservationError
 from kinefit.exporters.motion_file import write_motion
 from kinefit.readers.motion import read_motion
-from kinefit.simulation.figures import write_video
+from kinefit.simulation.figures import film, replayed, write_video
 from kinefit.simulation.movements import squat_and_wave
-from kinefit.simulation.replay import film, replayed
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from kinefit.errors import ObservationError
 from kinefit.geometry import se3
-from kinefit.solving.rigid_clusters import absolute_orientation, move
+from kinefit.solving.functional_joints import absolute_orientation, move
 
 RANDOM = np.random.default_rng(0)
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from benchmarks.accuracy.closures.closures_takes import RATE, Take, from_drive, towards
 from benchmarks.figures import amount, figure
 from kinefit.bodies import Body, load_body
-from kinefit.bodies.closures import Closure
 from kinefit.bodies.motion import Motion
+from kinefit.bodies.tree import Closure
 from kinefit.fitting.smoothing.foot_contacts import find_contacts
 from kinefit.fitting.tracking.video import track
 from kinefit.solving.rows import ParameterRows

@@ -29,8 +29,8 @@ from benchmarks.accuracy.closures.closures_takes import (
 )
 from benchmarks.figures import amount, figure, quick
 from kinefit.bodies import Body, load_body
-from kinefit.bodies.closures import Closure
 from kinefit.bodies.parts import with_dimensions
+from kinefit.bodies.tree import Closure
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.tracking.sizing import channels_of
 from kinefit.fitting.tracking.video import track

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.closures import Closure
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.parts import with_dimensions
+from kinefit.bodies.tree import Closure
 from kinefit.fitting.tracking.recording import Recording
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig

@@ -25,8 +25,8 @@ from kinefit import load_body, track_take
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.motion import BELIEVED, Motion
 from kinefit.bodies.surfaces import TaperedCylinder
+from kinefit.bodies.surfaces.mesh import BodyMesh
 from kinefit.bodies.surfaces.places import body_mesh
-from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.geometry.camera import Camera
 from kinefit.simulation.rendering.scenes import SimulatedScene
 from kinefit.simulation.rendering.sensors import DepthSensor, measured_depth

@@ -21,9 +21,7 @@ from kinefit.geometry.camera import Camera
 from kinefit.images.stereo import StereoRectifier
 from kinefit.readers.calibration.read import read_opencv_stereo
 from kinefit.solving.correspondences import collision_rows, free_space_rows
-from kinefit.solving.correspondences.occupancy.collisions import collision_pairs
-from kinefit.solving.correspondences.occupancy.depth_image import SurfaceSamples
-from kinefit.solving.correspondences.occupancy.free_space import FreeSpace
+from kinefit.solving.correspondences.occupancy.free_space import FreeSpace, SurfaceSamples, collision_pairs
 
 PAIRS = amount((1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14), (1, 5, 9))
 SQUARE = 0.025  # [m]

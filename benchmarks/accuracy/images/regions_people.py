@@ -27,7 +27,7 @@ from kinefit.fitting.smoothing.foot_contacts import find_contacts
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SilhouetteVideo
 from kinefit.papers.regions import pose_from_regions
-from kinefit.solving.correspondences.contours.rims import RimFinder
+from kinefit.solving.correspondences.contours.outlines import RimFinder
 
 FRAMES = amount(100, 3)
 TRACKED = amount(CAMERAS, CAMERAS[:2])

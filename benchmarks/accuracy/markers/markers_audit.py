@@ -12,8 +12,7 @@ from benchmarks.figures import NotMeasured, amount, data, each, figure
 from benchmarks.scenes.marker_takes import put_right
 from kinefit.bodies.marker_sets import find_marker_set
 from kinefit.markers.audit.audit import audit_take
-from kinefit.markers.model.gate import training_gate
-from kinefit.markers.model.learn import learn_model
+from kinefit.markers.model.learn import learn_model, training_gate
 from kinefit.markers.model.model import MarkerModel
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers

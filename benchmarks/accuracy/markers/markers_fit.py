@@ -29,9 +29,8 @@ from benchmarks.peers.environments import run_peer
 from kinefit import Markers, Motion, load_body, read_markers
 from kinefit.cli.markers._fit import worn_body
 from kinefit.exporters import write_markers, write_osim
-from kinefit.fitting.markers.poses import columns, sequence_both_ways
-from kinefit.fitting.markers.subject import MarkerSubject, fit_marker_subject
-from kinefit.fitting.tracking.markers import fit_markers
+from kinefit.fitting.markers.subject import MarkerSubject, columns, fit_marker_subject, sequence_both_ways
+from kinefit.fitting.tracking.video import fit_markers
 from kinefit.readers.c3d_file import read_c3d
 
 CHILD = {"hip": "thigh", "knee": "shank", "ankle": "foot", "shoulder": "upperarm", "elbow": "forearm", "wrist": "hand"}

@@ -20,7 +20,7 @@ from benchmarks.scenes.motions import library
 from kinefit import Markers, Motion, fit_marker_subject, fit_markers, load_body
 from kinefit.bodies import BodyState
 from kinefit.bodies.marker_sets import placement
-from kinefit.fitting.markers.poses import columns
+from kinefit.fitting.markers.subject import columns
 from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.solving.trajectory.sequence import fit_sequence
 

@@ -16,7 +16,7 @@ from benchmarks.accuracy.surfaces.video_bodies import CLICKS, SETUPS, another
 from benchmarks.accuracy.surfaces.video_bodies import cameras as cameras_of_video
 from benchmarks.figures import amount, figure
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.fitting.initialization.from_clicks import clickable, clicked_points, clicked_start
+from kinefit.fitting.initialization.from_points import clickable, clicked_points, clicked_start
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.se3 import log_so3
 from kinefit.simulation import squat_and_wave, studio_rig

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import LEFT_OUT, amount, figure, peers, quick, recording
 from benchmarks.peers.environments import run_peer
-from kinefit.images.photogrammetry.least_squares_matching import Matches
-from kinefit.images.photogrammetry.region_growing import Grid, Seeds, grow
+from kinefit.images.photogrammetry.least_squares_matching import Grid, Matches, Seeds, grow
 from kinefit.images.photogrammetry.spline_image import SplineImage
 from kinefit.images.photogrammetry.strain import Strain, strain
 

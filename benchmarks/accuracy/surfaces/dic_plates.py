@@ -25,9 +25,9 @@ from benchmarks.figures import LEFT_OUT, NotMeasured, amount, each, figure, peer
 from benchmarks.peers.environments import run_peer
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.images.photogrammetry.region_growing import Grid, Seeds, grow
+from kinefit.images.photogrammetry.least_squares_matching import Grid, Seeds, grow
 from kinefit.images.photogrammetry.spline_image import SplineImage
-from kinefit.images.photogrammetry.states import measure_states
+from kinefit.images.photogrammetry.surface import measure_states
 
 CASES = {"rigid_1px": 5, "platehole": 10}  # frame: half a pixel along both axes; one pixel at the loaded edge
 WINDOWS, STEP, MARGIN, SEED, SMOOTH = (21, 31), 10, 60, [200, 200], 1.0

@@ -19,11 +19,17 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure, recording
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
-from kinefit.images.photogrammetry.region_growing import Grid, grow
+from kinefit.images.photogrammetry.least_squares_matching import Grid, grow
 from kinefit.images.photogrammetry.seeding.unaided import sift_seeds
 from kinefit.images.photogrammetry.spline_image import SplineImage
-from kinefit.images.photogrammetry.states import displacement_std, measure_states, rigid_motion, surface_strain
-from kinefit.images.photogrammetry.surface import MeasuredSurface, measure
+from kinefit.images.photogrammetry.surface import (
+    MeasuredSurface,
+    displacement_std,
+    measure,
+    measure_states,
+    rigid_motion,
+    surface_strain,
+)
 
 CAMERAS, SIZE = ("201", "202"), (2464, 3280)
 SPECKLE = slice(430, 2180), slice(720, 1620)  # of the first photograph

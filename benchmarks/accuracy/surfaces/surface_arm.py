@@ -25,10 +25,9 @@ from kinefit.errors import KinefitError
 from kinefit.exporters.surface_files import write_field_picture
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.images.photogrammetry.region_growing import Grid
+from kinefit.images.photogrammetry.least_squares_matching import Grid
 from kinefit.images.photogrammetry.spline_image import SplineImage
-from kinefit.images.photogrammetry.states import measure_states, surface_strain
-from kinefit.images.photogrammetry.surface import measure
+from kinefit.images.photogrammetry.surface import measure, measure_states, surface_strain
 from kinefit.images.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
 from kinefit.images.photogrammetry.trajectories import Trajectories, uniform, within_bounds
 from kinefit.readers.videos.video import Video

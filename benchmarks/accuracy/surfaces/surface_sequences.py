@@ -37,12 +37,10 @@ from benchmarks.accuracy.surfaces.stereo_cylinder import (
 from benchmarks.accuracy.surfaces.stereo_cylinder import SIZE as CYLINDER_SIZE
 from benchmarks.figures import amount, data, figure
 from kinefit.geometry.camera import Rig
-from kinefit.images.photogrammetry.least_squares_matching import match
+from kinefit.images.photogrammetry.least_squares_matching import Grid, match
 from kinefit.images.photogrammetry.points.bright_points import find_spots
-from kinefit.images.photogrammetry.region_growing import Grid
 from kinefit.images.photogrammetry.spline_image import SplineImage
-from kinefit.images.photogrammetry.states import rigid_motion
-from kinefit.images.photogrammetry.surface import measure
+from kinefit.images.photogrammetry.surface import measure, rigid_motion
 from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.readers.videos.video import Video
 

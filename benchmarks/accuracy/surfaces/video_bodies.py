@@ -29,7 +29,7 @@ from benchmarks.scenes.bar_scene import draw_bar, wave_bar
 from benchmarks.scenes.textured import textured_picture
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.surfaces.places import body_mesh
-from kinefit.fitting.initialization.from_clicks import clickable
+from kinefit.fitting.initialization.from_points import clickable
 from kinefit.fitting.subject.parameters import World
 from kinefit.fitting.subject.surfaces import CylinderShape
 from kinefit.geometry import se3

@@ -12,7 +12,7 @@ from benchmarks.figures import amount, data
 from benchmarks.scenes.motions import MOTIONS, library
 from kinefit import Body, Markers, Motion, load_body, read_markers
 from kinefit.fitting.markers.subject import fit_marker_subject
-from kinefit.fitting.tracking.markers import fit_markers
+from kinefit.fitting.tracking.video import fit_markers
 from kinefit.simulation import cut
 from kinefit.simulation.retarget import known_motion
 

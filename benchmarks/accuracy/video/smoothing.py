@@ -29,7 +29,7 @@ from kinefit.geometry.losses import geman_mcclure
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.simulation.evaluation import angle_errors, joint_errors
 from kinefit.solving.trajectory.motion_prior import MotionPrior
-from kinefit.solving.trajectory.seen_points import SeenPoints
+from kinefit.solving.trajectory.sequence import SeenPoints
 from kinefit.solving.trajectory.smoothing import smooth
 
 JOINTS = {"Hip": "thigh", "Knee": "shank", "Ankle": "foot", "Shoulder": "upperarm", "Elbow": "forearm", "Wrist": "hand"}

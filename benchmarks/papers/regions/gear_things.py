@@ -14,8 +14,8 @@ from benchmarks.papers.regions.gear_scene import Thing
 from kinefit.bodies import Body
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.surfaces import BodyMesh, TaperedCylinder
+from kinefit.bodies.surfaces.mesh import triangles
 from kinefit.bodies.surfaces.places import body_mesh
-from kinefit.bodies.surfaces.triangles import triangles
 from kinefit.geometry import se3
 from kinefit.simulation.rendering.scenes import grain
 

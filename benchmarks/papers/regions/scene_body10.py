@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.bodies.surfaces import MeshSurface
-from kinefit.bodies.surfaces.mesh import read_obj
+from kinefit.bodies.surfaces.mesh import BodyMesh, read_obj
 from kinefit.bodies.surfaces.places import body_mesh
-from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import ColourFrame, DepthFrame
 

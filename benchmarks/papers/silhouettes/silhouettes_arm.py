@@ -21,7 +21,7 @@ from benchmarks.scenes.silhouettes_scene import shape_from_silhouettes
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.rendering import render_body, scaled
 from kinefit.bodies.surfaces.places import body_mesh
-from kinefit.fitting.initialization.from_silhouettes import Level, coarse_to_fine
+from kinefit.fitting.initialization.candidates import Level, coarse_to_fine
 from kinefit.fitting.subject.parameters import SegmentScales
 from kinefit.fitting.subject.surfaces import CylinderShape
 from kinefit.fitting.tracking.tracker import Tracker

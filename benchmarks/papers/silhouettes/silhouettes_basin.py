@@ -15,7 +15,7 @@ from benchmarks.scenes.curves import COLOURS, curves
 from benchmarks.scenes.silhouettes_scene import ring, standing
 from kinefit.bodies import load_body
 from kinefit.bodies.rendering import render_body
-from kinefit.fitting.initialization.from_silhouettes import LEVELS, coarse_to_fine
+from kinefit.fitting.initialization.candidates import LEVELS, coarse_to_fine
 from kinefit.observations import SilhouetteFrame
 
 OFF = amount((0, 5, 10, 15, 20, 25, 30, 35, 40), (0, 10, 20, 30))  # [deg]

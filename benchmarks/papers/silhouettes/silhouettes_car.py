@@ -17,7 +17,7 @@ from kinefit.bodies.rendering import render_body
 from kinefit.bodies.surfaces.fourier import FourierSurface
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.tree import KinematicTree
-from kinefit.fitting.initialization.from_silhouettes import Level, coarse_to_fine
+from kinefit.fitting.initialization.candidates import Level, coarse_to_fine
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SilhouetteFrame
 from kinefit.readers.calibration.read import write_calibration

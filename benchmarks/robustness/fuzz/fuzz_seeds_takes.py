@@ -165,7 +165,7 @@ def _trackers(folder: Path) -> Seed:
 
 
 def _bar(folder: Path) -> Seed:
-    from kinefit.rigs.bar.table import read_centroids
+    from kinefit.rigs.bar.targets import read_centroids
 
     rows = [f"{c},{i},{10 + i}.5,{5 + 8 * k}.25" for c in ("a", "b") for i in range(4) for k in (0, 1)]
     (folder / "bar.csv").write_text("camera,frame,u,v\n" + "\n".join(rows) + "\n")

@@ -30,7 +30,7 @@ from kinefit.readers.depth.recordings import read_clouds, read_depth
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.readers.videos.video import Video
-from kinefit.rigs.diagnostics.depth import depth_findings
+from kinefit.rigs.diagnostics.person import depth_findings
 from kinefit.sensors.kinds.silhouettes import read_silhouettes
 
 Answer = Callable[[Path], str]

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import _kernels
-from kinefit.bodies.closures import FIXED, Closure, Dimension
 from kinefit.bodies.morphs.operators import Operator
 from kinefit.bodies.surfaces import SkinnedMesh, Surface, TaperedCylinder
 from kinefit.bodies.surfaces.tables import SurfaceTables, tables
-from kinefit.bodies.tree import ROOT_DOFS, BodyState, KinematicTree
+from kinefit.bodies.tree import FIXED, ROOT_DOFS, BodyState, Closure, Dimension, KinematicTree
 from kinefit.errors import BodyError, check_choice
 from kinefit.geometry import se3
 

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from kinefit._files import repeated
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.closures import Closure, without_landmarks
 from kinefit.bodies.morphs.operators import Operator
 from kinefit.bodies.surfaces import MeshSurface, Surface
-from kinefit.bodies.tree import COLUMNS, BodyState, KinematicTree
+from kinefit.bodies.tree import COLUMNS, BodyState, Closure, KinematicTree, without_landmarks
 from kinefit.errors import BodyError, check_choice
 from kinefit.geometry import se3
 

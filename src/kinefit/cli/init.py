@@ -159,7 +159,7 @@ def _ask(out: Path, take: Take, seen: Observations, body: Body, step: int, brows
     """Show the page until its clicks give a start."""
     import webbrowser
 
-    from kinefit.fitting.initialization.from_clicks import clickable
+    from kinefit.fitting.initialization.from_points import clickable
     from kinefit.readers.landmarks.annotations import clicks_of
     from kinefit.studio.viewers.clicks import ClickPage
 
@@ -208,7 +208,7 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, steps: Seque
 
     from kinefit._files import regular, write_text
     from kinefit.bodies.serial import save_body
-    from kinefit.fitting.initialization.from_clicks import clickable, clicked_points, clicked_start
+    from kinefit.fitting.initialization.from_points import clickable, clicked_points, clicked_start
     from kinefit.readers.landmarks.annotations import clicks_text
 
     assert seen.rig is not None

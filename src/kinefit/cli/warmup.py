@@ -63,9 +63,9 @@ def _surfaces() -> None:
     from kinefit.fitting.tracking.tracker import Tracker
     from kinefit.geometry.camera import Camera, Rig
     from kinefit.geometry.se3 import transform
-    from kinefit.images.photogrammetry.region_growing import Grid
+    from kinefit.images.photogrammetry.least_squares_matching import Grid
     from kinefit.images.photogrammetry.spline_image import SplineImage
-    from kinefit.images.photogrammetry.states import measure_states, surface_strain
+    from kinefit.images.photogrammetry.surface import measure_states, surface_strain
     from kinefit.images.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
     from kinefit.observations import SurfacePointFrame
     from kinefit.sensors.surfaces.surface_points import SurfacePointSensor

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from kinefit._files import write_bytes, write_image, write_rows
 from kinefit.errors import ExportError
 from kinefit.images.photogrammetry.returning import PointReturn
-from kinefit.images.photogrammetry.states import displacement_std
 from kinefit.images.photogrammetry.strain import Strain
-from kinefit.images.photogrammetry.surface import MeasuredSurface
+from kinefit.images.photogrammetry.surface import MeasuredSurface, displacement_std
 from kinefit.images.photogrammetry.trajectories import Trajectories
 
 _MAX_IMAGE_SIDE_PX = 1400  # [px] of a picture's longer side

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from os import PathLike
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,12 +163,8 @@ class Keypoints:
 
     def rows(self, frames: slice, time_offset: float) -> Keypoints:
         """The keypoints of some frames; `time_offset` [s] is the time of the first."""
-        lifted = None if self.lifted is None else self.lifted[frames]
         sides_known = None if self.sides_known is None else self.sides_known[frames]
-        return replace(
-            self, points=self.points[frames], confidence=self.confidence[frames], lifted=lifted,
-            time_offset=time_offset, sides_known=sides_known,
-        )  # fmt: skip
+        return self._changed(lambda values: values[frames], time_offset=time_offset, sides_known=sides_known)
 
     def without(self, frames: NDArray) -> Keypoints:
         """The keypoints without the detections of some frames; `frames` (F,) bool."""
@@ -184,18 +182,17 @@ class Keypoints:
             out[frames] = values[frames][:, :, order]
             return out
 
-        return replace(
-            self, points=other(self.points), confidence=other(self.confidence),
-            lifted=None if self.lifted is None else other(self.lifted), sides_known=frames,
-        )  # fmt: skip
+        return self._changed(other, sides_known=frames)
 
     def first_points(self, keypoint_set: str, names: tuple[str, ...]) -> Keypoints:
         """The first points alone, as another keypoint set with these names."""
-        lifted = None if self.lifted is None else self.lifted[:, :, : len(names)]
-        points, confidence = self.points[:, :, : len(names)], self.confidence[:, :, : len(names)]
-        return replace(
-            self, keypoint_set=keypoint_set, names=names, points=points, confidence=confidence, lifted=lifted
-        )
+        return self._changed(lambda values: values[:, :, : len(names)], keypoint_set=keypoint_set, names=names)
+
+    def _changed(self, change: Callable[[NDArray], NDArray], **fields: Any) -> Keypoints:
+        """The record with each of its arrays of points (F, P, K, ...) changed, and other fields."""
+        arrays = {name: getattr(self, name) for name in ("points", "confidence", "lifted")}
+        changed: dict[str, Any] = {name: change(a) for name, a in arrays.items() if a is not None}
+        return replace(self, **changed, **fields)
 
     def of_one(self, chosen: NDArray) -> Keypoints:
         """The keypoints of one person; chosen (F,) int is the person's number in each frame, -1 for none."""

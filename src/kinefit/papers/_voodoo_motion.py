@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.geometry import se3
 from kinefit.papers import _voodoo_steps as steps
-from kinefit.solving.correspondences.bands import Bands
-from kinefit.solving.rigid_clusters import absolute_orientation, move
+from kinefit.solving.correspondences.closures import Bands
+from kinefit.solving.functional_joints import absolute_orientation, move
 
 _RANGE_LEVER = 0.1  # [m] from a joint to the points that show a limb's orientation
 _ANGLE_STEPS = 6  # of Newton's method from the default angles

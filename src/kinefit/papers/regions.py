@@ -21,15 +21,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.surfaces.mesh import BodyMesh
 from kinefit.bodies.surfaces.places import body_mesh
-from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.errors import ObservationError, check_choice
 from kinefit.geometry.camera import Rig
 from kinefit.papers._colour_densities import COLOURS, DENSITIES, colour_cells
 from kinefit.solving.correspondences import point_rows
 from kinefit.solving.correspondences.closures import closure_targets
-from kinefit.solving.correspondences.contours.outlines import outline_rows
-from kinefit.solving.correspondences.contours.rims import RimFinder
+from kinefit.solving.correspondences.contours.outlines import RimFinder, outline_rows
 from kinefit.solving.least_squares import gauss_newton
 from kinefit.solving.rows import Rows
 

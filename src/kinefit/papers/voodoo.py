@@ -22,7 +22,7 @@ from kinefit.papers import _voodoo_motion as motion
 from kinefit.papers import _voodoo_steps as steps
 from kinefit.papers._voodoo_input import Sight, near_body, sight_of
 from kinefit.papers._voodoo_steps import LimbFit
-from kinefit.solving.correspondences.bands import Bands, joint_bands
+from kinefit.solving.correspondences.closures import Bands, joint_bands
 
 _MAX_MOTION = 0.5  # [m] of a limb from frame to frame
 _HANDS = ("l_wrist", "r_wrist", "l_metacarpal_phalanx_3", "r_metacarpal_phalanx_3")

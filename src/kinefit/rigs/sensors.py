@@ -20,10 +20,9 @@ from kinefit.errors import ObservationError
 from kinefit.fitting.subject.fit import fit_subject
 from kinefit.fitting.subject.keypoints import fit_subject as fit_person
 from kinefit.fitting.subject.parameters import KnownLengths, Parameters, PointOffsets
-from kinefit.fitting.subject.sensor_parameters import SensorFrames
-from kinefit.fitting.subject.subject import Subject, SubjectFit
+from kinefit.fitting.subject.subject import SensorFrames, Subject, SubjectFit
 from kinefit.fitting.subject.surfaces import CylinderShape
-from kinefit.fitting.tracking.placing import (
+from kinefit.fitting.tracking.cameras import (
     Look,
     measurements_at,
     placed_camera,

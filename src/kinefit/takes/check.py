@@ -15,8 +15,8 @@ from kinefit.fitting.tracking.take_recording import label_findings_of, recording
 from kinefit.readers.take.cameras import is_alone
 from kinefit.readers.take.file import Take, read_take
 from kinefit.rigs.diagnostics.checks import CHECKS, Check, Checked, Progress, run
-from kinefit.rigs.diagnostics.depth import UNCHECKED, depth_findings
 from kinefit.rigs.diagnostics.images import finding_of
+from kinefit.rigs.diagnostics.person import UNCHECKED, depth_findings
 from kinefit.rigs.diagnostics.quick import inverted_findings
 from kinefit.rigs.sensors import fit_sensors
 from kinefit.sensors.alignment import sensor_findings

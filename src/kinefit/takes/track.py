@@ -13,7 +13,7 @@ from kinefit.bodies.motion import Motion
 from kinefit.errors import KinefitError, TakeError, command, located
 from kinefit.exporters.gait.plates import standing_mass
 from kinefit.exporters.report.feet import plate_faults
-from kinefit.fitting.smoothing.online.lag_frame import KnownNoise
+from kinefit.fitting.smoothing.online.fixed_lag import KnownNoise
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.subject.subject import Subject
 from kinefit.fitting.tracking.cameras import as_found
@@ -38,7 +38,7 @@ from kinefit.readers.take.load import Observations, load_observations
 from kinefit.rigs.diagnostics.images import load_uncovered
 from kinefit.rigs.diagnostics.quick import input_findings, with_cause, with_findings
 from kinefit.sensors.settings import TrackSettings
-from kinefit.solving.correspondences.bands import BAND, with_bands
+from kinefit.solving.correspondences.closures import BAND, with_bands
 from kinefit.takes.in_view import InView, people_in_view
 from kinefit.takes.missing import prepared
 

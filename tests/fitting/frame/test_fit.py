@@ -10,7 +10,7 @@ import pytest
 from kinefit import load_body
 from kinefit.bodies import BodyState
 from kinefit.fitting.frame.fit import FrameFit
-from kinefit.fitting.frame.trust import dofs_moving, dofs_of_joints, observed, reset_to_prior, without_segments
+from kinefit.fitting.frame.results import dofs_moving, dofs_of_joints, observed, reset_to_prior, without_segments
 from kinefit.observations import KeypointFrame
 from kinefit.sensors.points.keypoints import KeypointSensor
 from kinefit.sensors.scene import Scene

@@ -3,7 +3,7 @@
 import numpy as np
 
 from kinefit.bodies import load_body
-from kinefit.fitting.frame.trust import unknown_joints
+from kinefit.fitting.frame.results import unknown_joints
 
 TREE = load_body("humanoid").tree
 HAND, FOREARM, UPPERARM = (TREE.segments.index(f"{n}_r") for n in ("hand", "forearm", "upperarm"))

@@ -5,7 +5,7 @@ import pytest
 
 from kinefit.bodies import load_body
 from kinefit.errors import TrackingError
-from kinefit.fitting.initialization.from_clicks import clickable, clicked_points, clicked_start
+from kinefit.fitting.initialization.from_points import clickable, clicked_points, clicked_start
 from kinefit.geometry.camera import Rig
 from kinefit.simulation import squat_and_wave, studio_rig
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from kinefit import BodyState, load_body, read_markers
-from kinefit.fitting.markers.poses import columns, sequence_both_ways, split_people
-from kinefit.fitting.markers.subject import fit_marker_subject
+from kinefit.fitting.markers.subject import columns, fit_marker_subject, sequence_both_ways, split_people
 from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.solving.trajectory.sequence import fit_sequence
 

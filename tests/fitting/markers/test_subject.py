@@ -11,9 +11,8 @@ from kinefit.bodies import BodyState
 from kinefit.bodies.marker_sets import placement
 from kinefit.bodies.parts import with_dimensions
 from kinefit.errors import KinefitError, ObservationError, TrackingError
-from kinefit.fitting.markers.poses import columns, split_people
-from kinefit.fitting.markers.subject import fit_marker_subject
-from kinefit.fitting.tracking.markers import fit_markers
+from kinefit.fitting.markers.subject import columns, fit_marker_subject, split_people
+from kinefit.fitting.tracking.video import fit_markers
 from kinefit.readers.markers import read_markers
 from kinefit.simulation import squat_and_wave
 from kinefit.simulation.evaluation import joint_errors

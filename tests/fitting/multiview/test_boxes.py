@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 from kinefit.errors import ObservationError
-from kinefit.fitting.multiview.boxes import assign
+from kinefit.fitting.multiview.association import assign
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 6), (5, 1), (4, 4), (3, 7), (8, 2), (12, 12)])

@@ -5,8 +5,7 @@ import pytest
 from tests.fitting.multiview.test_people import NAMES, along, line, records
 from tests.oracle import look_at
 
-from kinefit.fitting.multiview.followed import follow, sentences
-from kinefit.fitting.multiview.mirrors import mark_mirror_images
+from kinefit.fitting.multiview.followed import follow, mark_mirror_images, sentences
 from kinefit.fitting.multiview.people import people_of
 from kinefit.geometry.camera import Rig
 from kinefit.observations.recordings import mirror_name

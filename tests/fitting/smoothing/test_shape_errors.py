@@ -7,9 +7,8 @@ import pytest
 from tests.fitting.subject import measured
 from tests.fitting.subject.measured import ARM, RIG
 
-from kinefit.fitting.smoothing.shape_errors import ShapeErrors, shape_errors
-from kinefit.fitting.subject.fit import fit_subject
-from kinefit.fitting.subject.matched_frames import Worlds
+from kinefit.fitting.smoothing.border import ShapeErrors, shape_errors
+from kinefit.fitting.subject.fit import Worlds, fit_subject
 from kinefit.fitting.subject.parameters import PointOffsets, SegmentScales, World
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.base import matched_by, rows_at

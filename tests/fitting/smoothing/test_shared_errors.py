@@ -11,7 +11,7 @@ from kinefit.fitting.smoothing.shared_errors import SharedErrors, members, share
 from kinefit.geometry.losses import SQUARED, geman_mcclure
 from kinefit.sensors.channels import make_channels
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
-from kinefit.solving.trajectory.seen_points import SeenPoints
+from kinefit.solving.trajectory.sequence import SeenPoints
 
 MOTION = squat_and_wave(rate=20.0, duration=2.0)
 RIG = studio_rig(MOTION)

@@ -11,7 +11,7 @@ from kinefit.fitting.smoothing.shared_errors import SharedErrors
 from kinefit.fitting.smoothing.uncertainty import KeypointPriors, systematic_errors
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.subject.parameters import World
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics
+from kinefit.fitting.subject.subject import CameraExtrinsics
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.channels import make_channels
 from kinefit.sensors.points.keypoints import Layout

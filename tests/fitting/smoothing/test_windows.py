@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from kinefit.fitting.smoothing.windows import parts
+from kinefit.fitting.smoothing.border import parts
 
 
 def test_windows_cover_a_take_once_and_overlap():

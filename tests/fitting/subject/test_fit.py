@@ -11,7 +11,7 @@ from kinefit.bodies import PointSet
 from kinefit.errors import ObservationError
 from kinefit.fitting.subject.fit import fit_subject
 from kinefit.fitting.subject.parameters import PointOffsets, SegmentScales
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics, OwnUnknowns
+from kinefit.fitting.subject.subject import CameraExtrinsics, OwnUnknowns
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.base import Measurement, RowsOf

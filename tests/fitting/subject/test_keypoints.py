@@ -10,7 +10,7 @@ from kinefit.bodies import BodyState, load_body
 from kinefit.errors import TakeError
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.subject.parameters import World
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics
+from kinefit.fitting.subject.subject import CameraExtrinsics
 from kinefit.observations import Keypoints
 from kinefit.readers.take.file import read_take
 from kinefit.sensors.channels import make_channels

@@ -10,18 +10,18 @@ from tests.fitting.subject.measured import ARM, HUMANOID, RIG
 
 from kinefit.bodies import BodyState, PointSet
 from kinefit.errors import BodyError, CalibrationError, ObservationError
-from kinefit.fitting.subject.gear import excess
-from kinefit.fitting.subject.matched_frames import MatchedFrames, Worlds
+from kinefit.fitting.subject.fit import MatchedFrames, Worlds
 from kinefit.fitting.subject.parameters import (
     KNOWN_SIZE_STD,
     UNKNOWN_SIZE_STD,
     PointOffsets,
     SegmentScales,
     World,
+    excess,
     place_spread,
     stacked,
 )
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics, OwnUnknowns
+from kinefit.fitting.subject.subject import CameraExtrinsics, OwnUnknowns
 from kinefit.geometry import se3
 from kinefit.geometry.losses import geman_mcclure
 from kinefit.sensors.base import RowsOf, Unknown

@@ -5,7 +5,7 @@ import pytest
 from tests.oracle import posture, rig_around
 
 from kinefit.bodies import load_body
-from kinefit.fitting.subject.matched_frames import MatchedFrames, Worlds
+from kinefit.fitting.subject.fit import MatchedFrames, Worlds
 from kinefit.fitting.subject.parameters import PointOffsets, SegmentScales, World, stacked
 from kinefit.geometry.losses import SQUARED
 from kinefit.observations import KeypointFrame

@@ -9,7 +9,7 @@ from kinefit.bodies.rendering import render_body
 from kinefit.bodies.surfaces.places import sample
 from kinefit.fitting.frame.routing import Sensors
 from kinefit.fitting.subject.fit import fit_subject
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics, moved_rig
+from kinefit.fitting.subject.subject import CameraExtrinsics, moved_rig
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, PointCloud, SilhouetteFrame

@@ -6,7 +6,7 @@ import pytest
 from kinefit import Recording, TrackSettings, read_take, track, track_take
 from kinefit.errors import TakeError
 from kinefit.fitting.subject.parameters import World
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics
+from kinefit.fitting.subject.subject import CameraExtrinsics
 from kinefit.fitting.tracking.cameras import as_found, between, composed, sentences
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit import BodyState, MarkerFrame, Recording
-from kinefit.fitting.tracking.marker_steps import fit_marker_steps
-from kinefit.fitting.tracking.run import run
+from kinefit.fitting.tracking.run import fit_marker_steps, run
 from kinefit.fitting.tracking.video import track
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.settings import TrackSettings

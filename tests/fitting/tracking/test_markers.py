@@ -11,7 +11,7 @@ from kinefit import BodyState, MarkerFrame, Markers, Recording, fit_marker_subje
 from kinefit.bodies.marker_sets import bare, placement
 from kinefit.errors import ObservationError
 from kinefit.fitting.smoothing.smoother import smooth_results
-from kinefit.fitting.tracking.marker_steps import fit_marker_steps
+from kinefit.fitting.tracking.run import fit_marker_steps
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.losses import SQUARED
 from kinefit.observations import NamedMarkers

@@ -9,7 +9,7 @@ from tests.sensors.scenes import at, ring
 from kinefit.bodies import load_body
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.rendering import Canvas
-from kinefit.fitting.subject.matched_frames import MatchedFrames, Worlds
+from kinefit.fitting.subject.fit import MatchedFrames, Worlds
 from kinefit.fitting.subject.parameters import World
 from kinefit.fitting.subject.surfaces import CylinderShape
 from kinefit.fitting.tracking.tracker import Tracker

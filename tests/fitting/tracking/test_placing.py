@@ -5,8 +5,7 @@ import pytest
 
 from kinefit import Recording, TrackSettings, load_body, track
 from kinefit.fitting.subject.keypoints import fit_subject
-from kinefit.fitting.tracking.cameras import CAMERAS, LEFT_OUT, sentences
-from kinefit.fitting.tracking.placing import placed_cameras
+from kinefit.fitting.tracking.cameras import CAMERAS, LEFT_OUT, placed_cameras, sentences
 from kinefit.fitting.tracking.sizing import channels_of
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig

@@ -29,8 +29,8 @@ CASES = [(30.0, with_a_thing, 0), (1.0, with_a_thing, 1), (1.0, depth_frame, 0)]
 @pytest.mark.parametrize(("rate", "sees", "times"), CASES)
 def test_between_frames_far_apart_limbs_are_sought_for_what_nothing_explains(monkeypatch, rate, sees, times):
     sought = []
-    monkeypatch.setattr(recovery, "find_limbs", lambda *_: sought.append(1) or [])
-    monkeypatch.setattr(recovery, "starts_from_views", lambda *_, **__: [])
+    monkeypatch.setattr(recovery.candidates, "find_limbs", lambda *_: sought.append(1) or [])
+    monkeypatch.setattr(recovery.candidates, "starts_from_views", lambda *_, **__: [])
     settings = TrackSettings(doubtful=0.0)
     tracker = Tracker(a_motion().body, a_rig(), rate=rate, settings=settings, on_body=("depth",), up="y")
     tracker.start_at(a_motion().state(0))
@@ -49,8 +49,8 @@ def test_a_limb_that_was_well_seen_at_this_very_time_may_move_as_far_as_in_a_fra
 
 @pytest.mark.parametrize(("sees", "said"), [(with_a_thing, True), (depth_frame, False)])
 def test_limbs_that_could_be_what_nothing_explains_are_said_to_be_lost(monkeypatch, sees, said):
-    monkeypatch.setattr(recovery, "find_limbs", lambda *_: [])
-    monkeypatch.setattr(recovery, "starts_from_views", lambda *_, **__: [])
+    monkeypatch.setattr(recovery.candidates, "find_limbs", lambda *_: [])
+    monkeypatch.setattr(recovery.candidates, "starts_from_views", lambda *_, **__: [])
     tracker = Tracker(a_motion().body, a_rig(), rate=1.0, on_body=("depth",), up="y")
     tracker.start_at(a_motion().state(0))
     result = tracker.update([sees(0)])
@@ -62,8 +62,8 @@ def test_limbs_that_could_be_what_nothing_explains_are_said_to_be_lost(monkeypat
 
 
 def test_a_guess_is_taken_where_more_speaks_for_it(monkeypatch):
-    monkeypatch.setattr(recovery, "find_limbs", lambda *_: [])
-    monkeypatch.setattr(recovery, "starts_from_views", lambda *_, **__: [])
+    monkeypatch.setattr(recovery.candidates, "find_limbs", lambda *_: [])
+    monkeypatch.setattr(recovery.candidates, "starts_from_views", lambda *_, **__: [])
     away = a_motion().state(0)
     root = np.array(away.T_world_root)
     root[:3, 3] += 0.8
@@ -82,7 +82,7 @@ def test_of_starts_in_one_place_the_view_decides_and_not_the_number_of_segments_
     root = np.array(truth.T_world_root)
     root[:3, :3] = np.diag([-1.0, 1.0, -1.0]) @ root[:3, :3]
     away = replace(truth, T_world_root=root)
-    monkeypatch.setattr(recovery, "starts_from_views", lambda *_, **__: [[truth, away][::order]])
+    monkeypatch.setattr(recovery.candidates, "starts_from_views", lambda *_, **__: [[truth, away][::order]])
     monkeypatch.setattr(recovery, "_better", lambda new, _: new.state.T_world_root[0, 0] * facing < 0.0)
     facing = truth.T_world_root[0, 0]
     result = Tracker(a_motion().body, a_rig(), rate=30.0, up="y").update([depth_frame(5)])

@@ -214,7 +214,7 @@ def test_a_limb_that_is_somewhere_else_is_sought_and_found():
 
 def test_a_track_backwards_seeks_as_often_as_one_forwards(monkeypatch):
     wrong, sought = turned(a_motion().state(9), arm_add_l=-80, elbow_flex_l=60), []
-    monkeypatch.setattr(recovery, "find_limbs", lambda *_: sought.append(1) or [])
+    monkeypatch.setattr(recovery.candidates, "find_limbs", lambda *_: sought.append(1) or [])
     tracker = a_tracker(start=None, settings=TrackSettings()).backwards(wrong)
     tracker._prediction.start(wrong, np.full(N, 0.02))
     for i in (9, 5, 1):

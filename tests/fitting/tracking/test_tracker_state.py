@@ -15,7 +15,7 @@ from tests.sensors.surfaces import test_surface_points
 
 from kinefit import Recording, track
 from kinefit.fitting.frame.prediction import Prediction
-from kinefit.fitting.smoothing.record_classes import CODEC
+from kinefit.fitting.smoothing.spool import CODEC
 from kinefit.fitting.tracking import run as running
 from kinefit.fitting.tracking.checkpoints.checkpoint import Checkpoint
 from kinefit.fitting.tracking.recovery import Recovery

@@ -10,8 +10,7 @@ from tests.oracle import rig_around
 
 from kinefit import Keypoints, MarkerFrame, Markers, load_body, track
 from kinefit.fitting.subject.parameters import KnownLengths, PointOffsets, SegmentScales, World
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics
-from kinefit.fitting.subject.subject import Subject
+from kinefit.fitting.subject.subject import CameraExtrinsics, Subject
 from kinefit.fitting.subject.surfaces import CylinderShape
 from kinefit.fitting.tracking.recording import Recording
 from kinefit.fitting.tracking.unknowns import of_all, of_points

@@ -6,8 +6,8 @@ from tests.images.photogrammetry import scenes
 
 from kinefit.errors import ObservationError
 from kinefit.images.photogrammetry._kernels_growing import pop, push
+from kinefit.images.photogrammetry.least_squares_matching import Grid, Seeds, grow
 from kinefit.images.photogrammetry.matching.multi_image import search_box
-from kinefit.images.photogrammetry.region_growing import Grid, Seeds, grow
 from kinefit.images.photogrammetry.seeding.unaided import sift_seeds
 from kinefit.images.photogrammetry.spline_image import SplineImage
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ObservationError
-from kinefit.images.photogrammetry.matching import _kernels_spline as kernels
+from kinefit.images.photogrammetry.matching import _kernels_matching as kernels
 from kinefit.images.photogrammetry.spline_image import SplineImage, grey, pixel_noise, template_share
 
 

@@ -9,10 +9,9 @@ from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.images.photogrammetry.intersection import intersect
-from kinefit.images.photogrammetry.region_growing import Grid
+from kinefit.images.photogrammetry.least_squares_matching import Grid
 from kinefit.images.photogrammetry.spline_image import SplineImage
-from kinefit.images.photogrammetry.states import measure_states, rigid_motion, surface_strain
-from kinefit.images.photogrammetry.surface import measure
+from kinefit.images.photogrammetry.surface import measure, measure_states, rigid_motion, surface_strain
 
 TEXTURE = scenes.Texture(0.005, 3)
 TILT = se3.transform(se3.exp_so3(np.array([0.05, 0.15, 0.0])), np.array([0.0, 0.01, 0.02]))

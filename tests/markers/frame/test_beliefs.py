@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from benchmarks.papers.markers.synthetic_points import random_pose, synthetic_body
 
-from kinefit.markers.frame.beliefs import MAX_NOISE, MIN_NOISE, Beliefs, learn_beliefs
 from kinefit.markers.frame.identify import identify
 from kinefit.markers.frame.search import LabelSearch, UnlabelledFrame
-from kinefit.markers.frame.tables import segment_tables
+from kinefit.markers.frame.tables import MAX_NOISE, MIN_NOISE, Beliefs, learn_beliefs, segment_tables
 
 
 def frames_without(body, label, count, distortion=0.02):

@@ -7,9 +7,18 @@ import pytest
 from benchmarks.papers.markers.synthetic_points import random_pose, synthetic_body
 
 from kinefit.errors import ObservationError
-from kinefit.markers.frame.explain import at_level, explain, gain_of
+from kinefit.markers.frame.explain import (
+    at_level,
+    cost_of,
+    explain,
+    gain_of,
+    labels_of,
+    polish,
+    resolve_conflicts,
+    rivals,
+    shared_points,
+)
 from kinefit.markers.frame.identify import identify
-from kinefit.markers.frame.polish import cost_of, labels_of, polish, resolve_conflicts, rivals, shared_points
 from kinefit.markers.frame.search import LabelSearch, UnlabelledFrame
 from kinefit.markers.frame.tables import segment_tables
 

@@ -7,8 +7,7 @@ from kinefit.bodies.marker_sets import load_marker_set
 from kinefit.errors import ExportError, FileError, ObservationError
 from kinefit.geometry.se3 import exp_so3
 from kinefit.markers.model.from_frame import model_from_frame
-from kinefit.markers.model.gate import training_gate
-from kinefit.markers.model.learn import learn_model
+from kinefit.markers.model.learn import learn_model, training_gate
 from kinefit.markers.model.model import load_model, save_model
 from kinefit.markers.model.rigid import fit_joint_few, reference_turn
 from kinefit.observations import Markers

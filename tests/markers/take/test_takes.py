@@ -6,11 +6,11 @@ from benchmarks.scenes.marker_takes import CASES, broken, load, training, truth_
 
 from kinefit.bodies.marker_sets import placement
 from kinefit.errors import ObservationError
-from kinefit.markers.frame.beliefs import Identification
+from kinefit.markers.frame.tables import Identification
 from kinefit.markers.model.learn import learn_model
 from kinefit.markers.take.consistency import Consistency, fill_gaps, gaps_of
+from kinefit.markers.take.naming import Votes, assign_pieces, find_pieces
 from kinefit.markers.take.takes import TakeSettings, identify_people, identify_take, one_after_the_other
-from kinefit.markers.take.votes import Votes, assign_pieces, find_pieces
 from kinefit.observations import Markers
 from kinefit.simulation import squat_and_wave
 

@@ -8,10 +8,8 @@ from kinefit.errors import CalibrationError, FileError
 from kinefit.geometry import se3
 from kinefit.rigs.bar.bundle import BarProblem
 from kinefit.rigs.bar.calibrate import calibrate_bar
-from kinefit.rigs.bar.placing import on_floor, place
-from kinefit.rigs.bar.start import epipolar, flat
-from kinefit.rigs.bar.table import read_centroids
-from kinefit.rigs.bar.targets import BarViews, targets_in
+from kinefit.rigs.bar.start import epipolar, flat, on_floor, place
+from kinefit.rigs.bar.targets import BarViews, read_centroids, targets_in
 from kinefit.solving.bundle.adjust import BundleState, adjust
 from kinefit.solving.bundle.cameras import CENTRE, COLUMNS, TIME, CameraPrior
 

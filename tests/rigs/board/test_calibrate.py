@@ -13,8 +13,7 @@ from kinefit.readers.calibration.read import read_calibration
 from kinefit.rigs.board.bundle import BoardProblem, Corners, adjust_boards
 from kinefit.rigs.board.calibrate import calibrate_board
 from kinefit.rigs.board.detection import Board, BoardView, CameraViews, Finder, fitting_boards, with_dictionary
-from kinefit.rigs.board.extrinsics import place_cameras
-from kinefit.rigs.board.intrinsics import calibrate_interiors
+from kinefit.rigs.board.extrinsics import calibrate_interiors, place_cameras
 from kinefit.rigs.board.sources import camera_sources, find_boards
 from kinefit.solving.bundle.adjust import BundleState
 from kinefit.solving.bundle.cameras import COLUMNS, FOCAL, POSE, TIME, CameraPrior

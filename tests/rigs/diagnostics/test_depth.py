@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from kinefit.cli import main
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.rigs.diagnostics.depth import depth_findings, moving_extent
+from kinefit.rigs.diagnostics.person import depth_findings, moving_extent
 
 FOCAL = 144.0
 V, U = np.indices((120, 160))

@@ -8,7 +8,7 @@ import pytest
 from kinefit.observations import DepthVideo, Keypoints, Markers
 from kinefit.observations.videos import LineVideo
 from kinefit.readers.take.load import Observations
-from kinefit.rigs.diagnostics.frozen import without_frozen
+from kinefit.rigs.diagnostics.images import without_frozen
 
 COUNT, FROZEN = 90, range(40, 65)
 RANDOM = np.random.default_rng(5)

@@ -7,8 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from kinefit.fitting.multiview.turned import turned_cameras
-from kinefit.fitting.multiview.views import make_views
+from kinefit.fitting.multiview.views import make_views, turned_cameras
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.readers.take.file import read_take

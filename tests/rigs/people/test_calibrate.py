@@ -9,9 +9,7 @@ from tests.rigs.people_data import BODY, ERRORS, errors, room, seen, walker
 from kinefit.errors import CalibrationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.rigs.people.calibrate import calibrate_people
-from kinefit.rigs.people.first_rig import first_rig
-from kinefit.rigs.people.floor import settled
+from kinefit.rigs.people.calibrate import calibrate_people, first_rig, settled
 from kinefit.rigs.people.skeletons import steady_person
 from kinefit.simulation import simulate_keypoints
 

@@ -11,7 +11,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.rigs.refine.gauge import aligned, covariance_in_gauge, generators, resized
 from kinefit.rigs.refine.refine import refine
-from kinefit.rigs.refine.sightings import PersonTrial, correlation_time, residual_correlation, shifted, sight
+from kinefit.rigs.refine.result import PersonTrial, correlation_time, residual_correlation, shifted, sight
 from kinefit.simulation import simulate_keypoints
 from kinefit.solving.bundle.cameras import COLUMNS, camera_jacobian, moved_rig
 

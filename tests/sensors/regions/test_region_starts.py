@@ -7,7 +7,7 @@ from tests.sensors.region_arm import CAMERA, RIG, arm, frame, state
 
 from kinefit.bodies import PointSet
 from kinefit.bodies.rendering import render_body
-from kinefit.fitting.frame.trust import angles_off_prediction
+from kinefit.fitting.frame.results import angles_off_prediction
 from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.observations import DepthFrame
 from kinefit.sensors.evidence import Evidence

@@ -12,7 +12,7 @@ from kinefit.bodies.motion import Motion
 from kinefit.bodies.rendering import render_body
 from kinefit.errors import ObservationError
 from kinefit.exporters import write_motion
-from kinefit.fitting.initialization.from_silhouettes import LEVELS, coarse_to_fine
+from kinefit.fitting.initialization.candidates import LEVELS, coarse_to_fine
 from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry.camera import Rig
 from kinefit.images.silhouette import outline

@@ -9,8 +9,8 @@ from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.limbs import limbs, of_fingers
 from kinefit.bodies.rendering import Canvas, rasterise
 from kinefit.bodies.surfaces import MeshSurface
+from kinefit.bodies.surfaces.mesh import triangles
 from kinefit.bodies.surfaces.places import body_mesh
-from kinefit.bodies.surfaces.triangles import triangles
 from kinefit.fitting.initialization.depth_score import MAX_DEPTH_ERROR, OVERLAP_COST, POSTURE_COST, Score, prior_sigmas
 from kinefit.sensors.surfaces.depth_view import UNMEASURED_TRUST, geodesic_ends, outside, splat, view_of
 

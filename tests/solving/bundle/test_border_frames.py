@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kinefit.fitting.subject.matched_frames import MatchedFrames, Worlds
+from kinefit.fitting.subject.fit import MatchedFrames, Worlds
 from kinefit.fitting.subject.parameters import SegmentScales, World
 from kinefit.geometry.losses import geman_mcclure
 from kinefit.sensors.channels import make_channels

@@ -7,7 +7,6 @@ from tests.oracle import rig_around
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.losses import SQUARED
 from kinefit.solving.bundle.adjust import BundleState, adjust
-from kinefit.solving.bundle.body_bundle import PointProblem
 from kinefit.solving.bundle.cameras import (
     COLUMNS,
     FOCAL,
@@ -19,6 +18,7 @@ from kinefit.solving.bundle.cameras import (
     moved_camera,
     moved_rig,
 )
+from kinefit.solving.bundle.shape import PointProblem
 
 
 def bundle_adjust(rig, pixels, x, prior, **options):

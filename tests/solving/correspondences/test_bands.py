@@ -11,8 +11,7 @@ from kinefit.bodies.surfaces.places import sample
 from kinefit.errors import BodyError
 from kinefit.geometry import se3
 from kinefit.solving.correspondences import band_rows, joint_bands, surface_rows
-from kinefit.solving.correspondences.bands import elliptic_bands, hinge_bands, universal_band, with_bands
-from kinefit.solving.correspondences.closures import closed_at
+from kinefit.solving.correspondences.closures import closed_at, elliptic_bands, hinge_bands, universal_band, with_bands
 from kinefit.solving.least_squares import gauss_newton, levenberg_marquardt
 
 RANDOM = np.random.default_rng(0)

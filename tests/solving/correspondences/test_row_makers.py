@@ -21,10 +21,10 @@ from tests.oracle import (
 
 import kinefit.solving.correspondences as correspondences
 from kinefit.bodies import BodyState, PointSet, TaperedCylinder, load_body
-from kinefit.bodies.closures import Closure
 from kinefit.bodies.morphs.morphing import JointMotion, LocalMorph, Morphing
 from kinefit.bodies.morphs.operators import Steering
 from kinefit.bodies.surfaces import Metaballs, SkinnedMesh
+from kinefit.bodies.tree import Closure
 from kinefit.errors import KinefitError
 from kinefit.geometry import lines
 from kinefit.geometry.camera import Rig
@@ -53,10 +53,8 @@ from kinefit.solving.correspondences import (
     surface_rows,
     target_rows,
 )
-from kinefit.solving.correspondences.contours.rims import Rim
-from kinefit.solving.correspondences.occupancy.collisions import CollisionPairs
-from kinefit.solving.correspondences.occupancy.depth_image import SurfaceSamples
-from kinefit.solving.correspondences.occupancy.free_space import FreeSpace
+from kinefit.solving.correspondences.contours.outlines import Rim
+from kinefit.solving.correspondences.occupancy.free_space import CollisionPairs, FreeSpace, SurfaceSamples
 
 LENSES = (("radtan", (-0.1, 0.05, 0.001, -0.002, 0.01)), ("radtan", ()), ("fisheye", (0.02, -0.01, 0.003, -0.001)))
 

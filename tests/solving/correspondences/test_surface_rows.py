@@ -7,7 +7,7 @@ from kinefit.bodies import load_body
 from kinefit.bodies.surfaces.places import nearest
 from kinefit.errors import ObservationError
 from kinefit.solving.correspondences import anchored_rows, surface_rows
-from kinefit.solving.correspondences.anchored import anchored
+from kinefit.solving.correspondences.surfaces import anchored
 
 BODY = load_body("humanoid10")
 STATE = BODY.default_state()

@@ -16,7 +16,7 @@ from kinefit.simulation import squat_and_wave, studio_rig
 from kinefit.solving.equations import block_diagonal, dense_pattern
 from kinefit.solving.trajectory import _kernels_band
 from kinefit.solving.trajectory.motion_prior import MotionPrior
-from kinefit.solving.trajectory.seen_points import SeenPoints
+from kinefit.solving.trajectory.sequence import SeenPoints
 from kinefit.solving.trajectory.smoothing import (
     Smoothed,
     _system,

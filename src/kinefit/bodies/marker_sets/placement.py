@@ -10,17 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.marker_sets.sets import (
-    LANDMARK_SPREAD,
-    MIN_COMMON_LABELS,
-    MarkerRecord,
-    SetRecord,
-    catalogue,
-    find_record,
-    marker_set_names,
-    matched,
-    plain,
-)
+from kinefit.bodies.marker_sets import sets as marker_sets
 from kinefit.errors import FileError, ObservationError
 
 
@@ -48,7 +38,7 @@ class MarkerPlacement:
 
 def placed_set_names() -> tuple[str, ...]:
     """Names of the marker sets of the catalogue with positions of markers on a body."""
-    return marker_set_names(placed=True)
+    return marker_sets.marker_set_names(placed=True)
 
 
 def placement(body: Body, marker_set: str | PathLike[str] | MarkerPlacement) -> MarkerPlacement:
@@ -68,8 +58,8 @@ def placement(body: Body, marker_set: str | PathLike[str] | MarkerPlacement) -> 
     name = str(marker_set)
     if name in body.marker_sets:
         points = body.markers(name)
-        return MarkerPlacement(name, points, np.full(len(points), LANDMARK_SPREAD))
-    record, source = find_record(marker_set, (*body.marker_sets, *placed_set_names()))
+        return MarkerPlacement(name, points, np.full(len(points), marker_sets.LANDMARK_SPREAD))
+    record, source = marker_sets.find_record(marker_set, (*body.marker_sets, *placed_set_names()))
     if not record.markers:
         raise FileError(
             "has no positions of its markers on a body", file=source, place="markers",
@@ -96,7 +86,7 @@ def find_placement(
     best, size = None, 0
     for name in names:
         whole = placement(body, name)
-        known = set(matched(labels, whole.points.names))
+        known = set(marker_sets.matched(labels, whole.points.names))
         shared = whole.select(n for n in whole.points.names if n in known)
         if best is None or len(shared.points) > len(best.points):
             best, size = shared, len(whole.points)
@@ -105,7 +95,7 @@ def find_placement(
             f"{len(labels)} trajectories without names",
             remedy="Identify first: `kinefit markers identify TAKE SUBJECT.json`, or `fit --subject SUBJECT.json`.",
         )
-    if best is None or len(best.points) < MIN_COMMON_LABELS:
+    if best is None or len(best.points) < marker_sets.MIN_COMMON_LABELS:
         count = 0 if best is None else len(best.points)
         given = marker_set.name if isinstance(marker_set, MarkerPlacement) else marker_set
         sets = f"set '{given}'" if given else "any marker set"
@@ -127,10 +117,12 @@ def find_placement(
 
 def ignored_labels(placed: MarkerPlacement, labels: Iterable[str]) -> tuple[str, ...]:
     """Labels of a recording that a set does not place: without computed points, and points without names ("*1")."""
-    known = catalogue().get(placed.name)
-    computed = set() if known is None else {plain(n) for c in known.computed for n in (c, known.mirror(c) or c)}
-    found = zip(labels, matched(labels, placed.points.names))
-    return tuple(n for n, own in found if own is None and not n.startswith("*") and plain(n) not in computed)
+    known = marker_sets.catalogue().get(placed.name)
+    names = () if known is None else (n for c in known.computed for n in (c, known.mirror(c) or c))
+    computed = {marker_sets.plain(n) for n in names}
+    found = zip(labels, marker_sets.matched(labels, placed.points.names))
+    unplaced = (n for n, own in found if own is None and not n.startswith("*"))
+    return tuple(n for n in unplaced if marker_sets.plain(n) not in computed)
 
 
 def known_set(body: Body, labels: Iterable[str], marker_set: str | None = None) -> str:
@@ -145,7 +137,7 @@ def known_set(body: Body, labels: Iterable[str], marker_set: str | None = None) 
     """
     labels = tuple(labels)
     sets = {marker_set: body.markers(marker_set)} if marker_set else {**body.marker_sets, "": body.landmarks}
-    shared = {name: len(set(matched(labels, points.names)) - {None}) for name, points in sets.items()}
+    shared = {name: len(set(marker_sets.matched(labels, points.names)) - {None}) for name, points in sets.items()}
     best = max(shared, key=lambda name: shared[name])
     if not shared[best]:
         raise ObservationError(
@@ -159,7 +151,7 @@ def _listed(labels: tuple[str, ...]) -> str:
     return ", ".join(labels[:8]) + (" ..." if len(labels) > 8 else "")
 
 
-def placed(body: Body, record: SetRecord) -> MarkerPlacement:
+def placed(body: Body, record: marker_sets.SetRecord) -> MarkerPlacement:
     """Place a set's record on a body; markers on segments or landmarks that the body does not have are dropped."""
     names, segments, at, spread = [], [], [], []
     for label, entry in record.markers.items():
@@ -174,12 +166,12 @@ def placed(body: Body, record: SetRecord) -> MarkerPlacement:
     return MarkerPlacement(record.name, points, np.array(spread))
 
 
-def _with_image(label: str, record: SetRecord) -> list[tuple[str, bool]]:
+def _with_image(label: str, record: marker_sets.SetRecord) -> list[tuple[str, bool]]:
     image = record.mirror(label)
     return [(label, False)] + ([(image, True)] if image and image not in record.markers else [])
 
 
-def _place(body: Body, entry: MarkerRecord, mirrored: bool) -> tuple[int, NDArray] | None:
+def _place(body: Body, entry: marker_sets.MarkerRecord, mirrored: bool) -> tuple[int, NDArray] | None:
     side = np.array((1.0, 1.0, -1.0 if mirrored else 1.0))
     if entry.landmark is not None:
         name = f"l_{entry.landmark[2:]}" if mirrored and entry.landmark.startswith("r_") else entry.landmark

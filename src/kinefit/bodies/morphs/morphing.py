@@ -24,11 +24,10 @@ from kinefit.bodies.morphs.operators import (
     Steering,
     radial_basis,
 )
-from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.mesh import BodyMesh, MeshSurface, triangles
 from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
-from kinefit.bodies.surfaces.triangles import BodyMesh, triangles
 from kinefit.bodies.tree import BodyState
 from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3

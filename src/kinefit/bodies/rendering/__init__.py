@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._arguments import check_shape, shaped
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.rendering import _kernels as kernels
+from kinefit.bodies.surfaces.mesh import BodyMesh
 from kinefit.bodies.surfaces.places import body_mesh
-from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 

@@ -2,11 +2,10 @@
 
 from kinefit.bodies.surfaces.cylinder import Box, TaperedCylinder, bounding_box
 from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface
-from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.mesh import BodyMesh, MeshSurface, segment_middles, triangles
 from kinefit.bodies.surfaces.metaballs import Metaballs
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
 from kinefit.bodies.surfaces.tables import SurfaceTables
-from kinefit.bodies.surfaces.triangles import BodyMesh, segment_middles, triangles
 
 Surface = TaperedCylinder | MeshSurface
 

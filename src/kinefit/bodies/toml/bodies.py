@@ -14,32 +14,12 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit._files import parse_toml, read_text, record_of
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.closures import KINDS, Closure, Dimension
 from kinefit.bodies.morphs.morph_files import morphs_of
 from kinefit.bodies.parts import with_dimensions
 from kinefit.bodies.surfaces.files import surfaces_of
 from kinefit.bodies.surfaces.skins.skinning import skin_of
-from kinefit.bodies.toml.records import (
-    ClosureRecord,
-    CouplingRecord,
-    DimensionRecord,
-    FileRecord,
-    JointRecord,
-    MarkerSetRecord,
-    PointRecord,
-    SegmentRecord,
-    Vector,
-    axes_of,
-    direction,
-    extended,
-    left,
-    merged,
-    mirrored,
-    refuse_repeated,
-    size_of,
-    with_images,
-)
-from kinefit.bodies.tree import COLUMNS, KinematicTree
+from kinefit.bodies.toml import records as tables
+from kinefit.bodies.tree import COLUMNS, KINDS, Closure, Dimension, KinematicTree
 from kinefit.errors import BodyError, check_choice, choices, located
 
 JOINT_TYPES = {"fixed": 0, "revolute": 1, "prismatic": 1, "universal": 2, "ball": 3, "free": 6}
@@ -89,16 +69,17 @@ def parse_body(text: str, source: str = "body") -> Body:
         return _body(_record(text, source), source)
 
 
-def _body(record: FileRecord, source: str) -> Body:
+def _body(record: tables.FileRecord, source: str) -> Body:
     segments, points, usual, coupling, morph, closure = (
         record.segment, record.landmarks, record.usual, record.coupling, record.morph, record.closure
     )  # fmt: skip
     if record.body.mirror:
         segments = _beside(segments, lambda s: s.name.endswith("_r"))
-        points = points | {left(n): mirrored(p) for n, p in points.items() if left(n) not in points}
-        usual = {left(n): v for n, v in usual.items()} | usual
-        coupling, closure = with_images(coupling), with_images(closure)
-        morph = _beside(morph, lambda m: m.kind != "global" and left(m.angle) != m.angle)
+        others = {tables.left(n): tables.mirrored(p) for n, p in points.items()}
+        points = points | {n: p for n, p in others.items() if n not in points}
+        usual = {tables.left(n): v for n, v in usual.items()} | usual
+        coupling, closure = tables.with_images(coupling), tables.with_images(closure)
+        morph = _beside(morph, lambda m: m.kind != "global" and tables.left(m.angle) != m.angle)
     segments = _in_order(segments)
     groups = tuple(dict.fromkeys(s.scale or s.name for s in segments))
     index = {s.name: i for i, s in enumerate(segments)}
@@ -112,7 +93,7 @@ def _body(record: FileRecord, source: str) -> Body:
         segment_scale=np.array([groups.index(s.scale or s.name) for s in segments]),
         landmarks=landmarks,
         keypoint_sets={
-            n: _renamed(s, landmarks, f"keypoints.{n}") for n, s in extended(record.keypoints).items()
+            n: _renamed(s, landmarks, f"keypoints.{n}") for n, s in tables.extended(record.keypoints).items()
         },
         marker_sets={n: _markers(s, landmarks, index, f"markers.{n}") for n, s in record.markers.items()},
         surfaces=tuple(
@@ -123,18 +104,18 @@ def _body(record: FileRecord, source: str) -> Body:
             c: {s.name: s.names[c] for s in segments if c in s.names}
             for c in dict.fromkeys(c for s in segments for c in s.names)
         },
-        stature=size_of("stature", record.body.stature or 0.0),
-        mass=size_of("mass", record.body.mass or 0.0),
+        stature=tables.size_of("stature", record.body.stature or 0.0),
+        mass=tables.size_of("mass", record.body.mass or 0.0),
         skin=skin_of(record.skin, tree, source),
         morphs=morphs_of(morph, tree, source),
     )  # fmt: skip
     return closed(body, closure, record.dimension) if closure or record.dimension else body
 
 
-def _record(text: str, source: str, above: tuple[str, ...] = ()) -> FileRecord:
+def _record(text: str, source: str, above: tuple[str, ...] = ()) -> tables.FileRecord:
     """Record of a body file, merged with its base."""
     remedy = "See docs/bodies.md for its keys."
-    record = record_of(parse_toml(text, source, BodyError), FileRecord, "a body file", source, remedy, BodyError)
+    record = record_of(parse_toml(text, source, BodyError), tables.FileRecord, "a body file", source, remedy, BodyError)
     most = max(len(record.segment), len(record.coupling), len(record.closure), len(record.dimension))
     if most > _MAX_SEGMENTS:
         problem = f"{most} segments, couplings, closures or dimensions, more than {_MAX_SEGMENTS}"
@@ -150,19 +131,19 @@ def _record(text: str, source: str, above: tuple[str, ...] = ()) -> FileRecord:
     except BodyError as error:
         raise BodyError(error.problem, place="body.base", remedy=error.remedy) from error
     with located(file):
-        return merged(_record(below, file, (*above, base)), record)
+        return tables.merged(_record(below, file, (*above, base)), record)
 
 
 def _beside(records: Iterable[Any], sided: Callable[[Any], bool]) -> list[Any]:
     """Records, and beside each that is of the right side its image."""
-    return [one for r in records for one in ((r, mirrored(r)) if sided(r) else (r,))]
+    return [one for r in records for one in ((r, tables.mirrored(r)) if sided(r) else (r,))]
 
 
-def _in_order(segments: list[SegmentRecord]) -> list[SegmentRecord]:
+def _in_order(segments: list[tables.SegmentRecord]) -> list[tables.SegmentRecord]:
     """Sort segments depth first from the root: parents before children, limbs contiguous."""
-    children: dict[str | None, list[SegmentRecord]] = {s.name: [] for s in segments}
-    refuse_repeated("segment", [s.name for s in segments])
-    refuse_repeated("joint", [s.joint.name for s in segments])
+    children: dict[str | None, list[tables.SegmentRecord]] = {s.name: [] for s in segments}
+    tables.refuse_repeated("segment", [s.name for s in segments])
+    tables.refuse_repeated("joint", [s.joint.name for s in segments])
     roots = [s for s in segments if s.parent is None]
     if len(roots) != 1:
         found = ", ".join(s.name for s in roots) or "none"
@@ -173,7 +154,7 @@ def _in_order(segments: list[SegmentRecord]) -> list[SegmentRecord]:
             place = f"parent of segment {s.name}"
             raise BodyError(choices("segment", s.parent, children), place=place, remedy=_CHOOSE)
         children.setdefault(s.parent, []).append(s)
-    out: list[SegmentRecord] = []
+    out: list[tables.SegmentRecord] = []
     stack = [roots[0]]
     while stack:
         s = stack.pop()
@@ -187,14 +168,14 @@ def _in_order(segments: list[SegmentRecord]) -> list[SegmentRecord]:
     return out
 
 
-def _tree(segments: list[SegmentRecord], index: dict[str, int]) -> KinematicTree:
+def _tree(segments: list[tables.SegmentRecord], index: dict[str, int]) -> KinematicTree:
     rows: list[tuple[Any, ...]] = []
     for i, s in enumerate(segments):
         with located(None, f"joint {s.joint.name}"):
             rows += _coordinates(i, s.joint)
     names = ("coordinates", "owners", *COLUMNS)
     columns = dict(zip(names, zip(*rows) if rows else [()] * len(names)))
-    refuse_repeated("coordinate", columns["coordinates"])
+    tables.refuse_repeated("coordinate", columns["coordinates"])
     return KinematicTree(
         segments=tuple(index),
         parents=np.array([index[s.parent] if s.parent else -1 for s in segments]),
@@ -204,7 +185,7 @@ def _tree(segments: list[SegmentRecord], index: dict[str, int]) -> KinematicTree
     )
 
 
-def _coordinates(owner: int, j: JointRecord) -> Iterator[tuple[Any, ...]]:
+def _coordinates(owner: int, j: tables.JointRecord) -> Iterator[tuple[Any, ...]]:
     """Name, owner, axis, whether it slides, lower, upper, usual and spread of each coordinate of a joint."""
     check_choice("joint type", j.type, JOINT_TYPES, BodyError, remedy="Use one of these.")
     if owner == 0 and any(j.at):
@@ -212,7 +193,7 @@ def _coordinates(owner: int, j: JointRecord) -> Iterator[tuple[Any, ...]]:
     _check_finite(j.at)
     if j.type == "free" and owner == 0:
         return
-    axes, slides = axes_of(j)
+    axes, slides = tables.axes_of(j)
     count = JOINT_TYPES[j.type]
     coordinates = j.coordinates or ([j.name] if count == 1 else [f"{j.name}_{k + 1}" for k in range(count)])
     if len(axes) != count or len(coordinates) != count or {len(j.range), len(j.usual), len(j.spread)} - {0, count}:
@@ -220,7 +201,7 @@ def _coordinates(owner: int, j: JointRecord) -> Iterator[tuple[Any, ...]]:
         problem += f"here {len(axes)}, {len(coordinates)}, {len(j.range)}, {len(j.usual)} and {len(j.spread)}"
         raise BodyError(problem, remedy="Give each of these lists one entry for each axis.")
     for k, name in enumerate(coordinates):
-        axis = direction(axes[k])
+        axis = tables.direction(axes[k])
         if axis is None:
             remedy = 'Use "x", "-y", ... or three numbers that are not all zero.'
             raise BodyError(f"axis {axes[k]!r} of {name} has no direction", remedy=remedy)
@@ -238,7 +219,7 @@ def _coordinates(owner: int, j: JointRecord) -> Iterator[tuple[Any, ...]]:
         yield name, owner, axis, slides[k], low * unit, high * unit, usual * unit, spread * unit
 
 
-def _coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord]) -> KinematicTree:
+def _coupled(tree: KinematicTree, couplings: Sequence[tables.CouplingRecord]) -> KinematicTree:
     """Add the couplings of a file to a tree; weights have no unit, spreads are in degrees."""
     lines = np.zeros((len(couplings), len(tree.coordinates)))
     for line, c in zip(lines, couplings):
@@ -271,12 +252,12 @@ def _with_posture(tree: KinematicTree, usual: Mapping[str, float]) -> KinematicT
     return replace(tree, usual=out)
 
 
-def _check_finite(at: Vector) -> None:
+def _check_finite(at: tables.Vector) -> None:
     if not np.isfinite(at).all():
         raise BodyError(f"`at` is not finite: {list(at)}", remedy="Give three numbers in metres.")
 
 
-def _points(points: Mapping[str, PointRecord], index: dict[str, int], what: str = "landmark ") -> PointSet:
+def _points(points: Mapping[str, tables.PointRecord], index: dict[str, int], what: str = "landmark ") -> PointSet:
     for name, p in points.items():
         with located(None, what + name):
             check_choice("segment", p.segment, index, BodyError, remedy=_CHOOSE)
@@ -294,7 +275,7 @@ def _renamed(entries: dict[str, str], landmarks: PointSet, place: str) -> PointS
     return replace(landmarks.select(tuple(entries.values())), names=tuple(entries))
 
 
-def _markers(entry: MarkerSetRecord, landmarks: PointSet, index: dict[str, int], place: str) -> PointSet:
+def _markers(entry: tables.MarkerSetRecord, landmarks: PointSet, index: dict[str, int], place: str) -> PointSet:
     on_landmarks = _renamed({n: n for n in entry.points}, landmarks, place)
     placed = _points(entry.placed, index, f"{place}.")
     if twice := sorted(entry.placed.keys() & set(entry.points)):
@@ -312,7 +293,7 @@ _MAX_DIMENSION = 1e4  # [m] or [deg]
 _ZERO_VECTOR = (0.0, 0.0, 0.0)
 
 
-def closed(body: Body, closures: Sequence[ClosureRecord], dimensions: Sequence[DimensionRecord]) -> Body:
+def closed(body: Body, closures: Sequence[tables.ClosureRecord], dimensions: Sequence[tables.DimensionRecord]) -> Body:
     """Add the closures and dimensions of a file to a body.
 
     Raises
@@ -324,8 +305,8 @@ def closed(body: Body, closures: Sequence[ClosureRecord], dimensions: Sequence[D
     if body.morphs:
         problem = "closures of a body whose joints or surfaces morph"
         raise BodyError(problem, place="closure", remedy="Remove the morphs, or the closures.")
-    refuse_repeated("closure", [c.name for c in closures])
-    refuse_repeated("dimension", [d.name for d in dimensions])
+    tables.refuse_repeated("closure", [c.name for c in closures])
+    tables.refuse_repeated("dimension", [d.name for d in dimensions])
     made, drawn, wanted = list[Closure](), list[Dimension](), dict[str, float]()
     for c in closures:
         with located(None, f"closure {c.name}"):
@@ -343,7 +324,7 @@ def _check(good: bool, problem: str, remedy: str) -> None:
         raise BodyError(problem, remedy=remedy)
 
 
-def _closure(body: Body, r: ClosureRecord) -> Closure:
+def _closure(body: Body, r: tables.ClosureRecord) -> Closure:
     names, segments = body.landmarks.names, body.landmarks.segments
     for point in (r.point, r.point if r.to is None else r.to):
         check_choice("landmark", point, names, BodyError, remedy="Use one of these, or add it under [landmarks].")
@@ -366,7 +347,7 @@ def _closure(body: Body, r: ClosureRecord) -> Closure:
     _check(all(0.0 < s < np.inf for s in sigmas), f"standard deviations {sigmas}", "Give positive ones.")
     apart = r.to is None or segments[names.index(r.to)] != segments[names.index(r.point)]
     _check(apart, f"'{r.point}' and '{r.to}' are of one segment", "Close the chain between two segments.")
-    axis = direction("y" if r.axis is None else r.axis)
+    axis = tables.direction("y" if r.axis is None else r.axis)
     if axis is None:
         remedy = 'Use "x", "y", "z", or three numbers that are not all zero.'
         raise BodyError(f"axis {r.axis!r} is no direction", remedy=remedy)
@@ -378,11 +359,11 @@ def _closure(body: Body, r: ClosureRecord) -> Closure:
     )  # fmt: skip
 
 
-def _vector(v: NDArray) -> Vector:
+def _vector(v: NDArray) -> tables.Vector:
     return (float(v[0]), float(v[1]), float(v[2]))
 
 
-def _dimension(body: Body, r: DimensionRecord) -> tuple[Dimension, float]:
+def _dimension(body: Body, r: tables.DimensionRecord) -> tuple[Dimension, float]:
     """A dimension at its drawn value, and its actual value [m] or [rad]."""
     one = (r.along is None) != (r.about is None)
     _check(one, "`along` and `about`: one of them is needed", "Give `along` for a length, `about` for an angle.")
@@ -408,7 +389,7 @@ def _dimension(body: Body, r: DimensionRecord) -> tuple[Dimension, float]:
         _check(placed, f"it shifts closure '{name}' between two landmarks", "Name one of the landmarks.")
     fits = np.abs([r.drawn, mean, value, *(r.along or r.about or ())]) < _MAX_DIMENSION
     _check(bool(fits.all()), "numbers are not finite, or not a dimension", "Give metres and degrees.")
-    axis = np.zeros(3) if r.about is None else direction(r.about)
+    axis = np.zeros(3) if r.about is None else tables.direction(r.about)
     if axis is None:
         raise BodyError("`about` is no direction", remedy="Give three numbers that are not all zero.")
     unit = 1.0 if r.about is None else np.pi / 180.0

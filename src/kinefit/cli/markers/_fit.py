@@ -21,8 +21,7 @@ from kinefit.exporters.skeletons.common import plain_names
 from kinefit.findings import FINDINGS, Finding, as_records, faults_of
 from kinefit.fitting.markers.subject import MarkerSubject
 from kinefit.markers.model.from_frame import model_from_frame
-from kinefit.markers.model.gate import TrainingFinding, training_gate
-from kinefit.markers.model.learn import learn_model
+from kinefit.markers.model.learn import TrainingFinding, learn_model, training_gate
 from kinefit.markers.model.model import MarkerModel, load_model
 from kinefit.markers.take.takes import (
     TakeIdentification,
@@ -198,8 +197,8 @@ def _doubts(found: dict[str, TakeIdentification], markers: Markers, many: bool) 
 
 def check_labels(markers: Markers, marker_set: str | None) -> list[Finding]:
     """Check sides and labels of every person of a take on the humanoid, where it has the labels (`label_findings`)."""
-    from kinefit.fitting.markers.poses import split_people
     from kinefit.fitting.markers.sides import label_findings
+    from kinefit.fitting.markers.subject import split_people
 
     found: list[Finding] = []
     for person in split_people(markers).values():
@@ -275,7 +274,7 @@ def fit_file(
     from kinefit.exporters.report.report import write_report
     from kinefit.fitting.markers.sides import label_findings, refuse_wrong_sides
     from kinefit.fitting.markers.subject import fit_marker_subject
-    from kinefit.fitting.tracking.markers import fit_markers
+    from kinefit.fitting.tracking.video import fit_markers
     from kinefit.rigs.diagnostics.quick import motion_findings
 
     step, formats, options = step or (lambda what, done, total: None), tuple(formats), options or MarkerFitOptions()
@@ -365,7 +364,7 @@ def worn_body(subject: MarkerSubject, labels: Iterable[str]) -> Body:
 
 def read_people(file: Path, unit: str | None, sides: str | None = None) -> dict[str, Markers]:
     """The people of a file, by the prefix of their labels, with left and right as `sides` states (see `read_sides`)."""
-    from kinefit.fitting.markers.poses import split_people
+    from kinefit.fitting.markers.subject import split_people
 
     markers = read_file(file, unit)
     if sides:

@@ -356,7 +356,7 @@ def replay(
     """Place a motion on a slope, move it downhill, and write it as a video or a motion."""
     from kinefit.exporters.motion_file import write_motion
     from kinefit.readers.motion import read_motion
-    from kinefit.simulation.replay import film, replayed
+    from kinefit.simulation.figures import film, replayed
 
     _screen.check_file(out, "--out")
     if beside is not None and out.suffix.lower() == ".npz":

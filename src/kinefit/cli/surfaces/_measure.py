@@ -30,14 +30,17 @@ from kinefit.exporters.surface_files import (
     write_velocity_picture,
 )
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.images.photogrammetry.flat import measure_flat
-from kinefit.images.photogrammetry.least_squares_matching import windows_by_texture
+from kinefit.images.photogrammetry.least_squares_matching import MIN_CORRELATION, Grid, Seeds, windows_by_texture
 from kinefit.images.photogrammetry.points.bright_points import BrightPointTracker
 from kinefit.images.photogrammetry.points.one_camera import flat_camera
-from kinefit.images.photogrammetry.region_growing import MIN_CORRELATION, Grid, Seeds
 from kinefit.images.photogrammetry.spline_image import SplineImage, grey
-from kinefit.images.photogrammetry.states import measure_states, rigid_motion, surface_strain
-from kinefit.images.photogrammetry.surface import MeasuredSurface
+from kinefit.images.photogrammetry.surface import (
+    MeasuredSurface,
+    measure_flat,
+    measure_states,
+    rigid_motion,
+    surface_strain,
+)
 from kinefit.images.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
 from kinefit.images.photogrammetry.trajectories import Trajectories, filtered
 from kinefit.observations.clocks import is_even

@@ -1,38 +1,88 @@
-"""Fit one frame: match the measurements, turn the matches into rows, solve for the state and its covariance."""
+"""Fit one frame: match the measurements, turn the matches into rows, solve for the state and its covariance.
+
+Minimise one frame's cost under fixed correspondences: for any rows, closed chains, or compiled for keypoints.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.fitting.frame.minimum import ROUGH_ITERATIONS, ROUGH_TOLERANCE, Minimum, minimum
+from kinefit.fitting.frame import results
 from kinefit.fitting.frame.prediction import prediction_row, release_dofs
-from kinefit.fitting.frame.results import ROOT_PRIOR_STD, FrameResult, evidence_of, frame_result, sum_evidence
 from kinefit.fitting.frame.skin import has_surface_offset, skin_of
-from kinefit.fitting.frame.trust import (
-    angles_off_prediction,
-    dofs_moving,
-    dofs_of_joints,
-    observed,
-    reset_to_prior,
-    segments_not_shown,
-    without_segments,
-)
-from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
+from kinefit.sensors.base import Matched, Measurement, matched_by, packed, rows_at
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.solving.closed import closed_step, on_null_space
-from kinefit.solving.correspondences.closures import HARD_SIGMA, hard_equations, looped, soft_closures
-from kinefit.solving.correspondences.occupancy.collisions import CollisionPairs, collision_pairs, collision_rows
+from kinefit.solving.closed import Constraint, closed_fit, closed_step, on_null_space
+from kinefit.solving.correspondences.closures import HARD_SIGMA, closed_at, hard_equations, looped, soft_closures
+from kinefit.solving.correspondences.occupancy.free_space import CollisionPairs, collision_pairs, collision_rows
 from kinefit.solving.correspondences.points import prior_rows
 from kinefit.solving.equations import inverse, joint_moves, normal_equations
-from kinefit.solving.least_squares import gauss_newton
+from kinefit.solving.least_squares import gauss_newton, levenberg_marquardt
+from kinefit.solving.pixels import INITIAL_DAMPING, fit_pixels
 from kinefit.solving.rows import AnyRows, DofRows, Rows, weaker
+
+_MAX_CLOSURE_ERROR = 0.01  # [m, rad] of a start; above it a first fit closes chains with this standard deviation
+ROUGH_ITERATIONS = 10
+"""At most, of a round that another round refines."""
+ROUGH_TOLERANCE = 1e-2
+"""Of such a round, see `levenberg_marquardt`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """A minimum: the scene, the normal matrix (n, n), the cost, the number of steps tried, and the match."""
+
+    scene: Scene
+    H: NDArray
+    cost: float
+    iterations: int
+    matched: tuple[Matched, ...]
+
+
+def minimum(
+    scene: Scene, held: tuple[BodyState, NDArray] | None, matched: Sequence[Matched],
+    rows: Callable[[Scene], list[AnyRows]], hard: Constraint | None, most: int, tolerance: float,
+) -> Minimum:  # fmt: skip
+    """Minimise the cost of a match from a scene's state.
+
+    Parameters
+    ----------
+    held : predicted state and its information (n, n)
+    rows : scene -> rows of the matches, of the prediction, of the posture prior
+    hard : equations of hard closures, None for none
+    most : int, iterations at most
+    tolerance : float, unitless, see `levenberg_marquardt`
+    """
+    pixels = packed(matched, scene) if held is not None and hard is None else None
+    if held is not None and pixels is not None:  # keypoints alone, of a body without morphs: by the compiled solver
+        found = fit_pixels(scene.body, scene.state, scene.rig, pixels, held, max_iterations=most, tolerance=tolerance)
+        if found is not None:
+            return Minimum(scene.at(found.state), found.H, found.cost, found.iterations, tuple(matched))
+
+    def at(state: BodyState) -> list[AnyRows]:
+        return rows(scene.at(state))
+
+    body, start, damping, tried = scene.body, scene.state, None if held is None else INITIAL_DAMPING, 0
+    if hard is None:
+        fit = levenberg_marquardt(body, start, at, max_iterations=most, tolerance=tolerance, damping=damping)
+    else:
+        if np.abs(hard(start)[0]).max() > _MAX_CLOSURE_ERROR:  # the nearest closed pose may be far from the data
+            near = levenberg_marquardt(
+                body, start, lambda state: [*at(state), closed_at(body, state).rows(_MAX_CLOSURE_ERROR)],
+                max_iterations=ROUGH_ITERATIONS, tolerance=ROUGH_TOLERANCE, damping=damping,
+            )  # fmt: skip
+            start, tried = near.state, near.iterations
+        fit = closed_fit(body, start, at, hard, max_iterations=most, tolerance=tolerance, damping=damping)
+    eq, tried = fit.equations, fit.iterations + tried
+    return Minimum(scene.at(fit.state), eq.matrix, eq.cost, tried, tuple(matched))
+
 
 _PRIOR_REMAINDER = 1e-6  # share of the prior that stays, so that an unobserved coordinate has a finite variance
 _MAX_MATCH_ROUNDS = 3  # of matching and solving, where only discrete parts of a match change
@@ -57,7 +107,7 @@ class Fitted:
     released : (n,) bool, optional: degrees of freedom whose prediction was discarded
     """
 
-    result: FrameResult
+    result: results.FrameResult
     filtered: NDArray
     stated: NDArray
     seen: NDArray
@@ -98,20 +148,20 @@ class FrameFit:
         points = [m for m in measurements if m.settled]
         every = len(points) == len(measurements)
         best = self._fit(scene, held, measurements)
-        evidence = evidence_of(best.scene, best.matched)
-        if points and sum_evidence(scene, [e for e, m in zip(evidence, measurements) if m.settled]).lost.any():
+        evidence = results.evidence_of(best.scene, best.matched)
+        if points and results.sum_evidence(scene, [e for e, m in zip(evidence, measurements) if m.settled]).lost.any():
             other = self._fit_to_minimum(scene, held, points, self._initial_reach(held))
             other = other if every else self._fit_step_by_step(other.scene, held, measurements)
-            new = evidence_of(other.scene, other.matched)
+            new = results.evidence_of(other.scene, other.matched)
             gain = best.cost - other.cost if every else sum(e.balance for e in new) - sum(e.balance for e in evidence)
             if gain > 0.0:
                 best, evidence = other, new
         released: NDArray | None = None
         for m, first_evidence in zip(measurements, list(evidence)):
             for state in m.starts(scene, None if held is None else held[1], first_evidence):
-                free = None if held is None else angles_off_prediction(*held, state)
+                free = None if held is None else results.angles_off_prediction(*held, state)
                 other = self._fit(scene.at(state), release_dofs(held, free), measurements)
-                new = evidence_of(other.scene, other.matched)
+                new = results.evidence_of(other.scene, other.matched)
                 better = m.better(other.scene, best.scene)
                 if better is None:
                     better = sum(e.balance for e in new) > sum(e.balance for e in evidence)
@@ -175,7 +225,7 @@ class FrameFit:
             return self.settings.far
         moves = joint_moves(self.body, held[0])
         variance = np.einsum("...i,...i->...", moves @ inverse(held[1]), moves).sum(axis=1)
-        return float(np.clip(np.sqrt(variance.max()), self.settings.far, ROOT_PRIOR_STD))
+        return float(np.clip(np.sqrt(variance.max()), self.settings.far, results.ROOT_PRIOR_STD))
 
     def rows(
         self, scene: Scene, held: Held | None, matched: Sequence[Matched], *, apart: bool = False,
@@ -207,12 +257,12 @@ class FrameFit:
 
     def _assess(self, found: Minimum, held: Held | None, each: Sequence[Evidence], known: NDArray | None) -> Fitted:
         """Covariances and quality of a fit, without rows on contradicted segments and of surfaces that occlude one."""
-        scene, tree, evidence = found.scene, self.body.tree, sum_evidence(found.scene, each)
+        scene, tree, evidence = found.scene, self.body.tree, results.sum_evidence(found.scene, each)
         A = np.zeros((0, tree.n_dofs)) if self._hard is None else self._hard(scene.state)[1]
         exact = A.T @ A / HARD_SIGMA**2
         H = found.H + exact
         lost = evidence.lost if evidence.lost.any() else None
-        off = [segments_not_shown(m, e) for m, e in zip(found.matched, each)]
+        off = [results.segments_not_shown(m, e) for m, e in zip(found.matched, each)]
         if lost is not None:
             off = [lost if segments is None else lost | segments for segments in off]
         without = off if any(segments is not None and segments.any() for segments in off) else None
@@ -232,9 +282,9 @@ class FrameFit:
         stated = posterior + self._surface_covariance(scene, found.matched, now, without)
         if lost is not None:
             elsewhere = np.zeros(len(lost), bool) if evidence.elsewhere is None else lost & evidence.elsewhere
-            gone = dofs_of_joints(tree, elsewhere) | (dofs_moving(tree, lost) & ~seen)
-            known, stated = known & ~gone[6:], reset_to_prior(tree, stated, gone)
-        result = frame_result(scene, stated, found.matched, found.iterations, observed=known, evidence=evidence)
+            gone = results.dofs_of_joints(tree, elsewhere) | (results.dofs_moving(tree, lost) & ~seen)
+            known, stated = known & ~gone[6:], results.reset_to_prior(tree, stated, gone)
+        result = results.frame_result(scene, stated, found.matched, found.iterations, observed=known, evidence=evidence)
         if lost is not None:
             result = replace(result, joint_std=np.where(elsewhere[:, None], np.inf, result.joint_std))
         return Fitted(result, inverse(alone), stated, seen[6:], known)
@@ -256,7 +306,7 @@ class FrameFit:
 
         A joint that moves points of images by less than `MIN_LEVER` is observed only if other sensors observe it.
         """
-        seen = observed(self.body.tree, now)
+        seen = results.observed(self.body.tree, now)
         moved = [m.moves(scene) for m in matched]
         moving = [of_points for of_points in moved if of_points is not None]
         if not moving:
@@ -268,7 +318,7 @@ class FrameFit:
                 off = without and [without[k] for k in others]
                 rows = self.rows(scene, None, [matched[k] for k in others], without=off)
                 H = normal_equations(self.body, scene.state, rows).matrix + _PRIOR_REMAINDER * np.eye(len(now))
-                short &= ~observed(self.body.tree, H)[6:]
+                short &= ~results.observed(self.body.tree, H)[6:]
             seen[6:] &= ~short
         return seen
 
@@ -309,7 +359,7 @@ def _kinds(
     for m, off in zip(matched, without or [None] * len(matched)):
         for rows in rows_at(m, scene):
             rows = weaker(rows, (scale or {}).get(m.sensor, 1.0))
-            rows = rows if off is None else without_segments(rows, off)
+            rows = rows if off is None else results.without_segments(rows, off)
             if has_surface_offset(rows, m):
                 surface.append(rows)
             else:
@@ -325,4 +375,3 @@ def rows_of_points(scene: Scene, matched: Sequence[Matched]) -> int:
 
 def _match(scene: Scene, measurements: Sequence[Measurement], reach: float) -> list[Matched]:
     return [matched_by(m, scene, reach) for m in measurements]
-

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.limbs import limbs, of_fingers
 from kinefit.bodies.rendering import Canvas, rasterise
+from kinefit.bodies.surfaces.mesh import BodyMesh
 from kinefit.bodies.surfaces.places import body_mesh
-from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.sensors.surfaces import _kernels_depth_view as kernels
 from kinefit.sensors.surfaces.depth_view import DepthView
-from kinefit.solving.correspondences.occupancy.collisions import CollisionPairs, collision_pairs
+from kinefit.solving.correspondences.occupancy.free_space import CollisionPairs, collision_pairs
 
 MAX_DEPTH_ERROR = 0.10  # [m] between rendered and measured surface of an explained pixel: the radius of a thigh
 OVERLAP_COST = 0.5  # [1/m] of the score per metre of self-penetration: 1 % for 2 cm, the softness of flesh

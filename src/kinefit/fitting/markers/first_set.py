@@ -14,8 +14,7 @@ from kinefit.bodies.body import Body
 from kinefit.bodies.marker_sets.placement import placed
 from kinefit.bodies.marker_sets.sets import LANDMARK_SPREAD, MarkerRecord, SetRecord, bare, catalogue, plain, side_pairs
 from kinefit.errors import KinefitError
-from kinefit.fitting.markers.poses import columns, sequence_both_ways
-from kinefit.fitting.markers.subject import fit_marker_subject
+from kinefit.fitting.markers.subject import columns, fit_marker_subject, sequence_both_ways
 from kinefit.markers.model.learn import learn_model, usable_markers
 from kinefit.observations import Markers
 

@@ -21,8 +21,7 @@ from kinefit.bodies.marker_sets import MarkerPlacement, find_placement, ignored_
 from kinefit.errors import ObservationError, shortened
 from kinefit.findings import Finding
 from kinefit.fitting.initialization.from_points import pose_from_points
-from kinefit.fitting.markers.poses import columns
-from kinefit.fitting.markers.subject import first_size
+from kinefit.fitting.markers.subject import columns, first_size
 from kinefit.observations import Markers
 
 _MAX_FRAMES = 24  # spread over the take

@@ -16,19 +16,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.fitting.multiview.association import (
-    MAX_SPEED,
-    MAX_STEP,
-    Node,
-    confidences,
-    distances,
-    group_views,
-    heights,
-    link_views,
-    medians,
-    some_columns,
-)
-from kinefit.fitting.multiview.boxes import assign, match_by_boxes, suppress_duplicates
+from kinefit.fitting.multiview import association
+from kinefit.fitting.multiview.association import Node
 from kinefit.fitting.multiview.likeness import ImageSource
 from kinefit.fitting.multiview.returns import MAX_SHORT_ABSENCE_S, Chain, PresenceSpan, Return, link_spans
 from kinefit.geometry.camera import Rig
@@ -84,7 +73,7 @@ def may_be_several(keypoints: Sequence[Keypoints]) -> bool:
     frames = min((len(k) for k in keypoints), default=0)
     of_camera: dict[str, NDArray] = {}
     for k in keypoints:
-        count = (confidences(k, frames) > 0).sum(axis=1)
+        count = (association.confidences(k, frames) > 0).sum(axis=1)
         of_camera[k.camera] = np.maximum(of_camera.get(k.camera, 0), count)
     people_count = np.sum([np.minimum(count, 2) for count in of_camera.values()], axis=0)
     enough = people_count >= 2 * views_needed(len(of_camera))
@@ -136,7 +125,8 @@ def people_of(rig: Rig, keypoints: Sequence[Keypoints], images: ImageSource | No
     for q in set(range(len(keypoints))) - set(main):
         source = next((r for r in main if keypoints[r].camera == keypoints[q].camera), None)
         if source is not None:
-            indices = match_by_boxes([track.chosen[source] for track in found], keypoints[source], keypoints[q])
+            chosen = [track.chosen[source] for track in found]
+            indices = association.match_by_boxes(chosen, keypoints[source], keypoints[q])
             for track, places in zip(found, indices):
                 track.chosen[q][:] = places
     return found
@@ -166,7 +156,7 @@ class _OpenTrack:
             self.path[frame] = self.x
             return
         motion = x - self.x
-        middle = medians(motion.T) if np.isfinite(motion).all(axis=1).any() else np.zeros(3)
+        middle = association.medians(motion.T) if np.isfinite(motion).all(axis=1).any() else np.zeros(3)
         x = np.where(np.isfinite(x), x, self.x + middle)
         step = (x - self.x) / max(abs(frame - self.last), 1)
         step *= np.minimum(1.0, reach / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9))
@@ -182,12 +172,12 @@ class _Search:
         self.rig, self.keypoints = rig, keypoints
         self.frames = min(len(k) for k in keypoints)
         self.rate = keypoints[0].rate
-        self.scores = [suppress_duplicates(k, confidences(k, self.frames)) for k in keypoints]
+        self.scores = [association.suppress_duplicates(k, association.confidences(k, self.frames)) for k in keypoints]
         self.cameras = [rig[k.camera] for k in keypoints]
         self.tracks: list[_OpenTrack] = []
         self.needed = views_needed(len({k.camera for k in keypoints}))
         names = keypoints[0].names
-        some = some_columns(len(names))
+        some = association.some_columns(len(names))
         mirrored = [names.index(m) if (m := mirror_name(names[k])) in names else k for k in some]
         self.uv, self.swapped_uv = ([_visible_points(k, columns) for k in keypoints] for columns in (some, mirrored))
         self.pairs = {
@@ -209,9 +199,9 @@ class _Search:
         new = self._new_people(frame)
         away = [t for t in recent if len(t.nodes.get(frame, ())) < 2]  # a single view counts as none
         cost = np.array([[_distance(t.x, x) for _, x in new] for t in away]).reshape(len(away), len(new))
-        reach = np.array([MAX_STEP + MAX_SPEED * (frame - t.last) / self.rate for t in away])
+        reach = np.array([association.MAX_STEP + association.MAX_SPEED * (frame - t.last) / self.rate for t in away])
         cost[cost > reach[:, None]] = np.inf
-        recovered = {k: away[i] for i, k in assign(cost)}
+        recovered = {k: away[i] for i, k in association.assign(cost)}
         for k, (nodes, x) in enumerate(new):
             track = recovered.get(k)
             if track is None:
@@ -219,7 +209,7 @@ class _Search:
                 self.tracks.append(track)
             else:
                 track.x, track.v, track.last = x, np.zeros_like(x), frame
-            track.extend(frame, nodes, x, MAX_SPEED / self.rate)
+            track.extend(frame, nodes, x, association.MAX_SPEED / self.rate)
 
     def _new_people(self, frame: int) -> list[tuple[list[Node], NDArray]]:
         """Unassigned detections that agree on a new person, and its points (k, 3) [m].
@@ -231,8 +221,8 @@ class _Search:
             return []
         full = len(self.keypoints) * len(self.keypoints[0].names)
         ranked: list[tuple[int, float, int, list[Node], NDArray]] = []
-        links = link_views(self.pairs, [uv[frame] for uv in self.uv], available)
-        for group in group_views(available, links, self.scores, frame, full):
+        links = association.link_views(self.pairs, [uv[frame] for uv in self.uv], available)
+        for group in association.group_views(available, links, self.scores, frame, full):
             nodes, x = self._consistent_views(frame, list(group.nodes), None)
             if x is not None and len(nodes) >= self.needed and not self._is_tracked(frame, x):
                 worst = max(self._view_error(x, n, self.uv[n[0]][frame, n[1]]) for n in nodes)
@@ -261,14 +251,15 @@ class _Search:
             if not detections or not tracks:
                 continue
             both = np.concatenate([self.uv[q][frame, detections], self.swapped_uv[q][frame, detections]])
-            errors = distances(self.cameras[q], np.array(expected), both)
+            errors = association.distances(self.cameras[q], np.array(expected), both)
             direct, swapped = errors[:, : len(detections)], errors[:, len(detections) :]
             swapped[np.isinf(direct)] = np.inf  # too few points
             cost = np.minimum(direct, swapped)
             waited = np.array([abs(frame - t.last) for t in tracks])
-            near = np.minimum(_MAX_DETECTION_DISTANCE + MAX_SPEED / _ASSUMED_STATURE * waited / self.rate, 0.5)
+            speed = association.MAX_SPEED / _ASSUMED_STATURE
+            near = np.minimum(_MAX_DETECTION_DISTANCE + speed * waited / self.rate, 0.5)
             cost[cost > near[:, None]] = np.inf
-            for t, p in assign(cost, 0.6):
+            for t, p in association.assign(cost, 0.6):
                 views[t].append((q, detections[p]))
                 view_costs[q, detections[p]] = float(cost[t, p])
                 if swapped[t, p] < direct[t, p]:
@@ -279,20 +270,20 @@ class _Search:
         updates: list[tuple[bool, int, float, int, list[Node], NDArray | None]] = []
         for k in (k for k in range(len(tracks)) if views[k]):
             gap = abs(frame - tracks[k].last_met)
-            reach = _MAX_PAIR_STEP + MAX_SPEED * gap / self.rate
+            reach = _MAX_PAIR_STEP + association.MAX_SPEED * gap / self.rate
             kept, found = self._consistent_views(frame, views[k], expected[k], sides, reach)
             cost_k = view_costs[kept[0]] if found is None else _distance(found, expected[k])
             if found is None and cost_k > _MAX_LONE_VIEW_ERROR:
                 unseen = [x for own, x in seen if kept[0][0] not in {q for q, _ in own}]
-                if any(_distance(expected[k], x) < 2.0 * MAX_STEP for x in unseen):
+                if any(_distance(expected[k], x) < 2.0 * association.MAX_STEP for x in unseen):
                     continue  # it may be of another person nearby, unseen by this camera
             updates.append((found is None, gap, cost_k, k, kept, found))
         for _, _, _, k, kept, found in sorted(updates, key=lambda one: one[:4]):
             new = accepted[len(others) :]
-            lone = found is None and any(_distance(expected[k], place) < MAX_STEP for _, place in new)
+            lone = found is None and any(_distance(expected[k], place) < association.MAX_STEP for _, place in new)
             if lone or any(self._is_same_person(frame, kept, found, *other, sides) for other in accepted):
                 continue  # duplicate detections of another person: two bodies cannot share a place
-            tracks[k].extend(frame, kept, found, MAX_SPEED / self.rate)
+            tracks[k].extend(frame, kept, found, association.MAX_SPEED / self.rate)
             if found is not None:
                 accepted.append((kept, found))
 
@@ -306,14 +297,14 @@ class _Search:
             return self._view_error(at, nodes[0], uv) <= _MAX_VIEW_ERROR
         distance, cameras = _distance(x, at), {q for q, _ in kept}
         added = [node for node in nodes if node[0] not in cameras]
-        if distance < _MIN_PERSON_DISTANCE or distance > 2.0 * MAX_STEP or not added:
+        if distance < _MIN_PERSON_DISTANCE or distance > 2.0 * association.MAX_STEP or not added:
             return distance < _MIN_PERSON_DISTANCE
         both = [*kept, *added]
         return len(self._consistent_views(frame, both, None, sides)[0]) == len(both)
 
     def _view_error(self, x: NDArray, node: Node, uv: NDArray) -> float:
         """Distance of a detection's points (k, 2) [px] from points (k, 3) [m], relative to its height."""
-        return float(distances(self.cameras[node[0]], x[None], uv[None])[0, 0])
+        return float(association.distances(self.cameras[node[0]], x[None], uv[None])[0, 0])
 
     def _consistent_views(
         self, frame: int, nodes: list[Node], expected: NDArray | None, sides: Collection[Node] = (),
@@ -328,7 +319,7 @@ class _Search:
         while len(nodes) > 1:
             each = [(self.swapped_uv if node in sides else self.uv)[node[0]][frame, node[1]] for node in nodes]
             uv = np.stack(each, axis=1)
-            height = float(medians(heights(np.moveaxis(uv, 0, 1))))
+            height = float(association.medians(association.heights(np.moveaxis(uv, 0, 1))))
             rig = self.rig.select(tuple(self.keypoints[q].camera for q, _ in nodes))
             x, _, _ = triangulate_robust(rig, uv, max_residual_px=max(1.0, _MAX_VIEW_ERROR * height))
             errors = np.array([self._view_error(x, node, own) for node, own in zip(nodes, each)])
@@ -349,10 +340,10 @@ class _Search:
         step = max(round(SPEED_INTERVAL_S * self.rate), 1)
         nodes, path = chain.span.nodes, chain.span.path
         moved = [path[f + step] - x for f, x in path.items() if f + step in path]
-        sizes = [heights(self.uv[q][f, p]) for f, each in nodes.items() for q, p in each]
+        sizes = [association.heights(self.uv[q][f, p]) for f, each in nodes.items() for q, p in each]
         confidence = sum(float(self.scores[q][f, p]) for f, each in nodes.items() for q, p in each)
-        place = medians(medians(np.moveaxis(np.array(list(path.values())), 1, 2)).T)
-        speed = float(np.mean(medians(np.linalg.norm(moved, axis=2)))) * self.rate / step if moved else 0.0
+        place = association.medians(association.medians(np.moveaxis(np.array(list(path.values())), 1, 2)).T)
+        speed = float(np.mean(association.medians(np.linalg.norm(moved, axis=2)))) * self.rate / step if moved else 0.0
         return PersonTrack(tuple(chosen), views, confidence, speed, float(np.nanmean(sizes)), place, chain.returns)
 
 

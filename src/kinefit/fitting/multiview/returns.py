@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.fitting.multiview.association import MAX_SPEED, MAX_STEP, Node, medians
-from kinefit.fitting.multiview.boxes import assign
+from kinefit.fitting.multiview.association import MAX_SPEED, MAX_STEP, Node, assign, medians
 from kinefit.fitting.multiview.likeness import (
     Appearance,
     ImageSource,

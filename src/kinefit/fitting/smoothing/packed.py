@@ -24,7 +24,7 @@ from kinefit.sensors.points.keypoints import KeypointMatched, pixels_of
 from kinefit.sensors.points.markers import MarkerMeasurement, MarkerSensor, markers_of, of_points
 from kinefit.sensors.points.views import find_swaps, limb_groups, trunks, view_offset
 from kinefit.sensors.scene import Scene
-from kinefit.solving.trajectory.seen_points import SeenPoints
+from kinefit.solving.trajectory.sequence import SeenPoints
 from kinefit.solving.trajectory.smoothing import unpacked
 
 MIN_INLIER_FACTOR = 0.25

@@ -19,7 +19,7 @@ from kinefit.fitting.smoothing.unwrap import boxes
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import Channels, joined
 from kinefit.solving.trajectory.motion_prior import MotionPrior
-from kinefit.solving.trajectory.seen_points import SeenPoints
+from kinefit.solving.trajectory.sequence import SeenPoints
 from kinefit.solving.trajectory.smoothing import Posterior, Smoothed, posterior, smooth
 
 _MEDIAN_SQUARE_2D = 2.0 * np.log(2.0)  # median |r|² of a normal error in the plane, in σ² (Rayleigh)

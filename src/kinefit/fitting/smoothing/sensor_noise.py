@@ -22,17 +22,9 @@ from kinefit.fitting.smoothing.tracked_frames import TrackedFrames
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import ChannelResiduals
 from kinefit.sensors.points.markers import MarkerMatched
+from kinefit.solving import equations
 from kinefit.solving.bundle.border_frames import gram
 from kinefit.solving.correspondences.closures import every_closure
-from kinefit.solving.equations import (
-    block_diagonal,
-    design,
-    inverse,
-    normal_equations,
-    point_derivatives,
-    product,
-    robust_factors,
-)
 from kinefit.solving.rows import DofRows, Rows, weaker
 from kinefit.solving.trajectory.variance_components import VarianceComponents, variance_components
 
@@ -156,11 +148,11 @@ def covariance_alone(body: Body, state: BodyState, information: NDArray) -> NDAr
     """
     tree = body.tree
     if body.closures:
-        information = information + normal_equations(body, state, every_closure(body, state)).matrix
+        information = information + equations.normal_equations(body, state, every_closure(body, state)).matrix
     free = slice(0 if tree.root_free else 6, tree.n_dofs)
-    prior = block_diagonal(np.eye(6) / ROOT_PRIOR_STD**2, tree.posture_precision)
+    prior = equations.block_diagonal(np.eye(6) / ROOT_PRIOR_STD**2, tree.posture_precision)
     out = np.zeros_like(information)
-    out[free, free] = inverse((information + prior)[free, free])
+    out[free, free] = equations.inverse((information + prior)[free, free])
     return out
 
 
@@ -174,7 +166,7 @@ def leverages(J: NDArray, pushed: NDArray, alone: NDArray) -> NDArray:
     J, pushed : (R, n) derivatives by the pose, and W J
     alone : (n, n) covariance P of the frame on its own
     """
-    residual = np.eye(len(J)) - product(product(J, alone), pushed.T)
+    residual = np.eye(len(J)) - equations.product(equations.product(J, alone), pushed.T)
     return np.asarray(1.0 - np.sum(residual**2, axis=1))
 
 
@@ -198,7 +190,7 @@ def noise_of_sensors(
         information = room(shape)
         errors |= _of_markers(take, information)
         # Neighbouring frames repeat the same error of the prior, which counts where the cost is flat.
-        rest = np.broadcast_to(block_diagonal(np.zeros((6, 6)), body.tree.posture_precision)[upper], shape)
+        rest = np.broadcast_to(equations.block_diagonal(np.zeros((6, 6)), body.tree.posture_precision)[upper], shape)
     if take.others is not None and matched is not None:
         information, rest = (np.add(values, 0.0, out=room(shape)) for values in (information, rest))
         errors |= _of_rows(take, take.others, matched, information, rest, surfaces=surfaces)
@@ -238,10 +230,10 @@ def _of_rows(
             made = [r for r in rows_at(m, scene) if r.weight.ndim == 1 and len(r)]
             points = [r for r in made if not has_surface_offset(r, m)]
             surface += [weaker(r, scale) for r in made if has_surface_offset(r, m)]
-            weights = [r.weight * robust_factors(r)[0] / scale**2 for r in points]
+            weights = [r.weight * equations.robust_factors(r)[0] / scale**2 for r in points]
             for rows, w, at in zip(points, weights, residuals.add(f, m, points, [r.residual for r in points], weights)):
                 used = w > 0.0
-                J, w, at = design(body, scene.state, rows)[used], w[used], at[:, used]
+                J, w, at = equations.design(body, scene.state, rows)[used], w[used], at[:, used]
                 information[f] += gram(J, w[:, None] * J)[upper]
                 pushed.append((m.sensor, _summed(at, w[:, None] * J, w)))
                 assumed = scale**2 / rows.weight[used]
@@ -281,7 +273,8 @@ def _of_markers(take: SmoothTake, information: NDArray) -> dict[str, _SensorErro
 
     def pushes(f: int, own: NDArray) -> list[_Push]:
         seen = np.flatnonzero(weight[f, own] > 0.0)
-        J = point_derivatives(body, BodyState(take.roots[f], take.angles[f]), markers.points)[own[seen]].reshape(-1, n)
+        state = BodyState(take.roots[f], take.angles[f])
+        J = equations.point_derivatives(body, state, markers.points)[own[seen]].reshape(-1, n)
         w = np.repeat(weight[f, own[seen]], 3)
         return [(np.stack([np.repeat(seen, 3), np.tile(np.arange(3), len(seen))]), w[:, None] * J, w)]
 

@@ -12,15 +12,13 @@ from numpy.typing import NDArray
 from kinefit._threads import side_by_side
 from kinefit.bodies import Body, BodyState
 from kinefit.findings import runs_of
-from kinefit.fitting.frame.results import UNOBSERVED_STD_RATIO, FrameResult, frame_result, frame_results
-from kinefit.fitting.frame.trust import unknown_joints
-from kinefit.fitting.smoothing.border import Border, with_border
+from kinefit.fitting.frame.results import UNOBSERVED_STD_RATIO, FrameResult, frame_result, frame_results, unknown_joints
+from kinefit.fitting.smoothing.border import Border, parts, solved, solved_with_covariances, with_border
 from kinefit.fitting.smoothing.foot_contacts import find_contacts
 from kinefit.fitting.smoothing.process_noise import SmoothTake, estimate, estimate_activity
 from kinefit.fitting.smoothing.spool import MATRIX_FRAMES, Spool, stretches
 from kinefit.fitting.smoothing.tracked_frames import TrackedFrames
 from kinefit.fitting.smoothing.unwrap import unwrap
-from kinefit.fitting.smoothing.windows import parts, solved, solved_with_covariances
 from kinefit.sensors.base import Matched
 from kinefit.sensors.evidence import moves_points, near
 from kinefit.sensors.points.keypoints import pixels_of

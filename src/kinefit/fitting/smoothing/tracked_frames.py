@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.fitting.frame.fit import rows_of
-from kinefit.fitting.frame.results import FrameResult, evidence_of
-from kinefit.fitting.frame.trust import segments_not_shown
+from kinefit.fitting.frame.results import FrameResult, evidence_of, segments_not_shown
 from kinefit.fitting.smoothing.packed import PackedMarkers, PackedPixels
 from kinefit.fitting.smoothing.spool import Spool
 from kinefit.sensors.base import Matched, Measurement, matched_by

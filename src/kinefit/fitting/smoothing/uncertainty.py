@@ -24,15 +24,14 @@ from kinefit._mapped import release, room
 from kinefit.bodies import Body, BodyState, KinematicTree
 from kinefit.bodies.lasting_errors import KEYS_AT_ONCE, LastingErrors, ParameterErrors, key_frames
 from kinefit.fitting.frame.results import FrameResult
+from kinefit.fitting.smoothing.border import SAMPLED_FRAMES, ShapeErrors, parameter_errors
 from kinefit.fitting.smoothing.process_noise import SmoothTake
 from kinefit.fitting.smoothing.sensor_noise import OtherNoise, Pushes, covariance_alone, filled, leverages
-from kinefit.fitting.smoothing.shape_errors import SAMPLED_FRAMES, ShapeErrors, parameter_errors
 from kinefit.fitting.smoothing.shared_errors import SharedErrors
 from kinefit.fitting.smoothing.spool import stretches
-from kinefit.fitting.subject.matched_frames import closing_moves, point_moves
+from kinefit.fitting.subject.fit import closing_moves, point_moves
 from kinefit.fitting.subject.point_moves import ClosureMoves, PointMoves
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics, same_cameras
-from kinefit.fitting.subject.subject import Subject, SubjectFit
+from kinefit.fitting.subject.subject import CameraExtrinsics, Subject, SubjectFit, same_cameras
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.points.keypoints import Layout
 from kinefit.sensors.settings import CameraErrors

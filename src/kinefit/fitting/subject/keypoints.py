@@ -12,18 +12,9 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import TrackingError
 from kinefit.fitting.initialization.from_points import first_scales, pose_from_points
 from kinefit.fitting.subject import fit as joint
-from kinefit.fitting.subject.gear import Gear, excess
-from kinefit.fitting.subject.matched_frames import MatchedFrames, Worlds
-from kinefit.fitting.subject.parameters import (
-    KnownLengths,
-    Parameters,
-    PointOffsets,
-    SegmentScales,
-    World,
-    place_spread,
-)
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics
-from kinefit.fitting.subject.subject import Progress, Subject, SubjectFit
+from kinefit.fitting.subject import parameters as kinds
+from kinefit.fitting.subject.fit import MatchedFrames, Worlds
+from kinefit.fitting.subject.subject import CameraExtrinsics, Progress, Subject, SubjectFit
 from kinefit.fitting.subject.view_bias import SeenFrames, learn_view_bias
 from kinefit.geometry.losses import geman_mcclure
 from kinefit.observations import KEYPOINTS
@@ -101,10 +92,10 @@ def fit_subject(
         for f, w in zip(states, weight)
     ]
     whole = height / body.stature if height and body.stature else None
-    lengths = SegmentScales(body, whole, about=float(np.median(scales)))
+    lengths = kinds.SegmentScales(body, whole, about=float(np.median(scales)))
     if trial is not None and trial.covariance is not None:
         known = trial.covariance[: len(scales), : len(scales)]
-        lengths = KnownLengths(body, scales=trial.scales, covariance=known)
+        lengths = kinds.KnownLengths(body, scales=trial.scales, covariance=known)
     if isinstance(cameras, CameraErrors):
         cameras = CameraExtrinsics.of(
             cameras, channels.rig, tuple(channels.rig.names[c] for c in np.unique(channels.camera))
@@ -119,7 +110,7 @@ def fit_subject(
 
 def _fitted(
     body: Body, channels: Channels, steps: Sequence[Sequence[KeypointMeasurement]], states: Sequence[BodyState],
-    lengths: SegmentScales, scales: NDArray, cameras: CameraExtrinsics | None, by_view: bool,
+    lengths: kinds.SegmentScales, scales: NDArray, cameras: CameraExtrinsics | None, by_view: bool,
 ) -> tuple[SubjectFit, NDArray, ViewBias]:  # fmt: skip
     """Fit lengths, points, gear and cameras; returns the fit, its covariance, and the detectors' bias by view.
 
@@ -128,17 +119,17 @@ def _fitted(
     removed in later ones. Detector bias would move cameras: the weight of their calibration is raised by the excess of
     the round before.
     """
-    spread, excess_of, start, gear, bias = np.array(_OFFSET_PRIOR_STDS), 1.0, None, Gear(body), ViewBias()
+    spread, excess_of, start, gear, bias = np.array(_OFFSET_PRIOR_STDS), 1.0, None, kinds.Gear(body), ViewBias()
     sets = [name for name in channels.sets if name]
     shares = [body.offset_shares[body.keypoints(name).segments] for name in sets]
     bare = body if body.morphs else replace(body, surfaces=(), skin=None)  # saves scaling surfaces
     cameras = cameras and replace(cameras, rig=channels.rig)
     for k in range(_ROUNDS):
         offsets = [
-            PointOffsets(body, name, spread[(own < 1.0).astype(int)] * own) for name, own in zip(sets, shares)
+            kinds.PointOffsets(body, name, spread[(own < 1.0).astype(int)] * own) for name, own in zip(sets, shares)
         ]
         has_gear = k > 0 and bool(gear.names)  # gear starts from poses of the first round
-        parameters: list[Parameters] = [lengths, *[gear] * has_gear, *offsets]
+        parameters: list[kinds.Parameters] = [lengths, *[gear] * has_gear, *offsets]
         of_body = sum(len(kind.names) for kind in parameters)
         before = of_body - sum(len(kind.names) for kind in offsets)
         if cameras is not None:
@@ -166,14 +157,14 @@ def _fitted(
         for short, of in enumerate((share == 1.0, share < 1.0)):
             open_to = np.flatnonzero(of & np.isclose(np.diag(prior) * share**2, spread[short] ** -2))
             offset, variance = moved[open_to] / share[open_to], np.diag(covariance)[open_to] / share[open_to] ** 2
-            spread[short] = place_spread(offset, variance, spread[short], _OFFSET_PRIOR_STDS[short])
+            spread[short] = kinds.place_spread(offset, variance, spread[short], _OFFSET_PRIOR_STDS[short])
         if cameras is not None:
             measured, own = found.information / excess_of, slice(of_body, len(moved))
             cameras = cameras.with_errors_of(own, moved, measured, found.prior.information / excess_of)
             prior[own, own] = cameras.information
             covariance = inverse(prior + measured)
         excess_of = max(excess_of, 1.0)
-    prior_world = World(body, channels.rig)
+    prior_world = kinds.World(body, channels.rig)
     found = replace(found, body=Worlds(prior_world, parameters).at(found.mean).body, prior_world=prior_world)
     if cameras is not None:
         found = replace(found, parameters=(*parameters[:-1], cameras))
@@ -229,7 +220,7 @@ def _excess(found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]) -
     frames = MatchedFrames(worlds, steps, None, None, found.mean, found.states, joint.REACH[0])
     known = len(found.mean) - float(np.sum(prior * inverse(prior + found.information)))
     rows = frames.rows_of_frames(found.mean, found.states)
-    return excess(rows, found.body.tree.n_dofs + known).get(KEYPOINTS, 1.0)
+    return kinds.excess(rows, found.body.tree.n_dofs + known).get(KEYPOINTS, 1.0)
 
 
 def _pose(body: Body, channels: Channels, x_world: NDArray, near: BodyState | None) -> BodyState | None:

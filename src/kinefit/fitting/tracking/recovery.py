@@ -15,13 +15,7 @@ from kinefit.fitting.frame.fit import Fitted
 from kinefit.fitting.frame.prediction import marginal_information
 from kinefit.fitting.frame.results import ROOT_PRIOR_STD, FrameResult, evidence_of, sum_evidence
 from kinefit.fitting.frame.routing import Sensors
-from kinefit.fitting.initialization.candidates import (
-    LEAP,
-    dofs_of_limbs,
-    find_limbs,
-    starts_from_points,
-    starts_from_views,
-)
+from kinefit.fitting.initialization import candidates
 from kinefit.fitting.initialization.depth_search import PostureSearch
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.base import Measurement
@@ -112,7 +106,7 @@ class Recovery:
             return result
         search = self._search(tracker, time, measurements, result)
         doubtful = np.zeros(len(result.lost), bool)
-        if search is not None and search.score.missing(result.state) > LEAP:
+        if search is not None and search.score.missing(result.state) > candidates.LEAP:
             x = np.concatenate(search.score.unexplained(result.state))
             near = [s for limb in search.limbs for s in limb if search.within_reach(result.state, limb, x).mean() > 0.5]
             doubtful[near] = True
@@ -142,7 +136,7 @@ class Recovery:
             seek = lost
             if rare:
                 search = self._search(tracker, time, measurements, result)
-            if search is not None and search.score.missing(result.state) > LEAP:  # a limb may lie on another
+            if search is not None and search.score.missing(result.state) > candidates.LEAP:  # a limb may lie on another
                 seek = lost | self._of_limbs
             self._good[~seek] = time
             if not seek[0]:
@@ -161,7 +155,7 @@ class Recovery:
             result = self._limbs(tracker, time, frames, search, result, seek, lost)
         if rare:
             search = self._search(tracker, time, measurements, result)
-            missing = search is not None and search.score.missing(result.state) > LEAP
+            missing = search is not None and search.score.missing(result.state) > candidates.LEAP
             if result.lost.any() or missing:
                 return self._from_views(tracker, time, frames, result, search if missing else None)
         return result
@@ -174,7 +168,7 @@ class Recovery:
         scene = tracker.scene_of(self.body.default_state(np.eye(4)), time)
         known = measurements or tracker.sensors.measurements(frames, scene, points=True)
         rays = result is None or abs(time - self._sought) >= self.settings.search_every - 0.25 / self.rate
-        for state in starts_from_points(self.body, known, scene, self.up, rays=rays):
+        for state in candidates.starts_from_points(self.body, known, scene, self.up, rays=rays):
             found = tracker.fitted(time, frames, state).result
             if result is None or found.support > result.support + _GAIN:
                 result, self._lost_since = found, time
@@ -192,7 +186,7 @@ class Recovery:
         known = self._root if elapsed <= _TURN + 1e-6 else None
         here = None if result is None or _astray(result, self.settings.poor) else result.state.T_world_root
         began = result
-        for states in starts_from_views(
+        for states in candidates.starts_from_views(
             scene, frames, self.up, own.measurements(frames, scene, points=True),
             backgrounds=own.stated, forward=None if known is None else known[:3, 0],
         ):  # fmt: skip
@@ -209,7 +203,7 @@ class Recovery:
                     result, self._lost_since = found, time
                     tracker.restart(found)
             if result is not None and not _astray(result, self.settings.poor):
-                if search is None or search.score.missing(result.state) <= LEAP:
+                if search is None or search.score.missing(result.state) <= candidates.LEAP:
                     break  # another attempt costs as much
         return result
 
@@ -226,20 +220,20 @@ class Recovery:
         view = self._search(tracker, old.time, old.measurements, old)
         if view is None or _gone(new.state.T_world_root, old.state.T_world_root) > _STRIDE:
             return _better(new, old)
-        values = [view.value(r.state) - LEAP * _against(tracker, r) for r in (new, old)]
+        values = [view.value(r.state) - candidates.LEAP * _against(tracker, r) for r in (new, old)]
         return values[0] > values[1]
 
     def _limbs(
         self, tracker: Searching, time: float, frames: Sequence[Any], search: PostureSearch, result: FrameResult,
         seek: NDArray, lost: NDArray,
     ) -> FrameResult:  # fmt: skip
-        free = dofs_of_limbs(self.body, seek)
+        free = candidates.dofs_of_limbs(self.body, seek)
         std = np.minimum(result.dof_std, np.where(np.arange(len(free)) < 6, ROOT_PRIOR_STD, np.pi))
         held = result.state, marginal_information(inverse(np.diag(std**2)), free)
-        now = best = search.score.of(result.state) - LEAP * _against(tracker, result)
-        for state, least in find_limbs(search, result.state, seek, lost):
+        now = best = search.score.of(result.state) - candidates.LEAP * _against(tracker, result)
+        for state, least in candidates.find_limbs(search, result.state, seek, lost):
             found = tracker.fitted(time, frames, state, held).result
-            value = search.score.of(found.state) - LEAP * _against(tracker, found)
+            value = search.score.of(found.state) - candidates.LEAP * _against(tracker, found)
             if not self._shown(tracker, found, lost):
                 continue
             if value > max(best, now + least * self._leap(time, result, found, seek)):
@@ -298,7 +292,7 @@ def _explains(search: PostureSearch | None, new: FrameResult, old: FrameResult) 
     """Less of the person is missing, by a limb at least, and nothing that was explained before is in its place."""
     if search is None or search.score.of(new.state) <= search.score.of(old.state):
         return False
-    return search.score.missing(new.state) < search.score.missing(old.state) - LEAP
+    return search.score.missing(new.state) < search.score.missing(old.state) - candidates.LEAP
 
 
 def _better(new: FrameResult, old: FrameResult) -> bool:

@@ -17,17 +17,13 @@ from kinefit.findings import INVERTED
 from kinefit.fitting.frame.results import FrameResult
 from kinefit.fitting.initialization.from_depth import Start, StartSearch, sized_start, start_from_points
 from kinefit.fitting.markers.subject import MarkerSubject, fit_marker_subject
-from kinefit.fitting.multiview.turned import turned_cameras
-from kinefit.fitting.multiview.views import make_views
+from kinefit.fitting.multiview.views import make_views, turned_cameras
 from kinefit.fitting.subject import fit as joint
-from kinefit.fitting.subject.gear import Gear
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.subject.metaballs import ROUNDS, MetaballShape
-from kinefit.fitting.subject.parameters import SegmentScales
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics, moved_rig
-from kinefit.fitting.subject.subject import Progress, Subject, SubjectFit
-from kinefit.fitting.tracking.cameras import CAMERAS, LEFT_OUT, between, composed
-from kinefit.fitting.tracking.placing import placed_cameras
+from kinefit.fitting.subject.parameters import Gear, SegmentScales
+from kinefit.fitting.subject.subject import CameraExtrinsics, Progress, Subject, SubjectFit, moved_rig
+from kinefit.fitting.tracking.cameras import CAMERAS, LEFT_OUT, between, composed, placed_cameras
 from kinefit.fitting.tracking.recording import Recording, spread
 from kinefit.fitting.tracking.recovery import is_rare
 from kinefit.fitting.tracking.run import OtherPeople, TrackedSteps, run, tracker_of

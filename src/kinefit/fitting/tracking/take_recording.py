@@ -16,7 +16,7 @@ from kinefit.bodies.marker_sets import LANDMARK_SPREAD, MarkerPlacement, bare, f
 from kinefit.bodies.motion import UP_AXES, Motion
 from kinefit.errors import BodyError, KinefitError, ObservationError, TakeError, choices, located
 from kinefit.findings import Finding
-from kinefit.fitting.initialization.from_silhouettes import coarse_to_fine
+from kinefit.fitting.initialization.candidates import coarse_to_fine
 from kinefit.fitting.markers.sides import label_findings, refuse_wrong_sides
 from kinefit.fitting.multiview.people import PersonTrack
 from kinefit.fitting.smoothing.foot_contacts import FloorPlane, find_contacts, soles

@@ -21,9 +21,8 @@ from kinefit.fitting.frame.prediction import Prediction
 from kinefit.fitting.frame.results import FrameResult
 from kinefit.fitting.frame.routing import Sensors, time_of
 from kinefit.fitting.subject.subject import Subject
-from kinefit.fitting.tracking.motions import Estimation, motion_of
+from kinefit.fitting.tracking.motions import Estimation, Session, axis_of, motion_of, up_vector
 from kinefit.fitting.tracking.recovery import Recovery
-from kinefit.fitting.tracking.session import Session, axis_of, up_vector
 from kinefit.geometry.camera import Rig
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Measurement, Sensor, named, of_kind

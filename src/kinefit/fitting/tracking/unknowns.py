@@ -10,20 +10,9 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.fitting.multiview.followed import only_lifted
-from kinefit.fitting.subject.fit import REACH
-from kinefit.fitting.subject.gear import Gear
-from kinefit.fitting.subject.matched_frames import MatchedFrames, Worlds
-from kinefit.fitting.subject.parameters import (
-    UNKNOWN_SIZE_STD,
-    KnownLengths,
-    Parameters,
-    PointOffsets,
-    SegmentScales,
-    World,
-    place_spread,
-)
-from kinefit.fitting.subject.sensor_parameters import CameraExtrinsics, OwnUnknowns
-from kinefit.fitting.subject.subject import Subject, SubjectFit
+from kinefit.fitting.subject import parameters as kinds
+from kinefit.fitting.subject.fit import REACH, MatchedFrames, Worlds
+from kinefit.fitting.subject.subject import CameraExtrinsics, OwnUnknowns, Subject, SubjectFit
 from kinefit.fitting.subject.surfaces import shape_of
 from kinefit.fitting.tracking.recording import Recording
 from kinefit.geometry.camera import Rig
@@ -50,8 +39,8 @@ class Unknowns:
     start : (p,) values to start from
     """
 
-    world: World
-    parameters: tuple[Parameters, ...]
+    world: kinds.World
+    parameters: tuple[kinds.Parameters, ...]
     start: NDArray
 
     def with_places_of(self, found: SubjectFit, stated: Unknowns) -> Unknowns:
@@ -69,10 +58,12 @@ class Unknowns:
         moved = found.mean - found.prior.mean
         for k, (one, before) in enumerate(zip(self.parameters, stated.parameters)):
             own = slice(first, first := first + len(one.names))
-            if isinstance(one, PointOffsets) and isinstance(before, PointOffsets) and one.name in one.body.marker_sets:
+            if isinstance(one, kinds.PointOffsets) and isinstance(before, kinds.PointOffsets):
+                if one.name not in one.body.marker_sets:
+                    continue
                 std, factor = (1.0 / np.sqrt(np.diag(p.information)) for p in (before, one))
                 ratio = float(np.median(factor / std))
-                wider = place_spread(found.mean[own] / std, variance[own] / std**2, ratio, 1.0)
+                wider = kinds.place_spread(found.mean[own] / std, variance[own] / std**2, ratio, 1.0)
                 parameters[k] = replace(one, std=wider * np.asarray(before.std))
             elif isinstance(one, CameraExtrinsics):
                 parameters[k] = one.with_errors_of(own, moved, found.information, found.prior.information)
@@ -106,18 +97,18 @@ def of_points(
     generic = replace(generic, marker_sets={**generic.marker_sets, **places})
     lengths = _size_by_network(generic, recording)
     if height and generic.stature:
-        lengths = SegmentScales(generic, height / generic.stature)
+        lengths = kinds.SegmentScales(generic, height / generic.stature)
     if trial is not None and trial.covariance is not None:
         count = len(trial.scales)
-        lengths = KnownLengths(generic, scales=trial.scales, covariance=trial.covariance[:count, :count])
-    found: list[tuple[Parameters, NDArray]] = [(lengths, np.log(subject.scales)), *_gear(generic, states)]
+        lengths = kinds.KnownLengths(generic, scales=trial.scales, covariance=trial.covariance[:count, :count])
+    found: list[tuple[kinds.Parameters, NDArray]] = [(lengths, np.log(subject.scales)), *_gear(generic, states)]
     found += list(_keypoint_offsets(generic, subject).values())
     if recording.alone is not None:
-        one = PointOffsets(generic, recording.keypoints[0].keypoint_set, _ONE_CAMERA)
+        one = kinds.PointOffsets(generic, recording.keypoints[0].keypoint_set, _ONE_CAMERA)
         found.insert(0, (one, one.mean))  # offsets are of the generic body: in metres, they would favour a small one
     scaled = generic.scaled(subject.scales)
     for name in sets:
-        offsets = PointOffsets(generic, name, stds[name])
+        offsets = kinds.PointOffsets(generic, name, stds[name])
         found.append((offsets, offsets.values_of(worn[name].points - scaled.markers(name).points)))
     used = tuple(dict.fromkeys(k.camera for k in recording.keypoints))
     if cameras is not None and used:
@@ -125,17 +116,17 @@ def of_points(
         factors = before.factors if before is not None and before.free == used else None
         poses = CameraExtrinsics.of(cameras, recording.rig, used, factors, calibrated)
         found.append((poses, np.zeros(len(poses.names))))
-    return _together(World(generic, recording.rig), found)
+    return _together(kinds.World(generic, recording.rig), found)
 
 
-def _size_by_network(body: Body, recording: Recording) -> SegmentScales:
+def _size_by_network(body: Body, recording: Recording) -> kinds.SegmentScales:
     """Lengths whose common size is that of people, and by a network's metres where it lifted landmarks to space."""
     record = only_lifted(recording.keypoints)
     size = np.nan if record is None else person_size(body, record)
     if not np.isfinite(size):
-        return SegmentScales(body)
-    share = UNKNOWN_SIZE_STD**2 / (UNKNOWN_SIZE_STD**2 + SIZE_STD**2)
-    return SegmentScales(body, about=size**share, about_std=SIZE_STD * share**0.5)
+        return kinds.SegmentScales(body)
+    share = kinds.UNKNOWN_SIZE_STD**2 / (kinds.UNKNOWN_SIZE_STD**2 + SIZE_STD**2)
+    return kinds.SegmentScales(body, about=size**share, about_std=SIZE_STD * share**0.5)
 
 
 def _of(values: NDArray, whole: PointSet, part: PointSet) -> NDArray:
@@ -158,7 +149,7 @@ def of_all(
     surfaces : whether any sensor sees them
     steps, states : what was measured at some poses of the body, which tell where gear and sensors' unknowns begin
     """
-    found: list[tuple[Parameters, NDArray]] = []
+    found: list[tuple[kinds.Parameters, NDArray]] = []
     if size and lengths and (surfaces or recording.markers or any(s.places_points for s in recording.sensors)):
         found.append((_size_by_network(body, recording), np.zeros(len(body.scale_groups))))
     if size and surfaces:
@@ -166,18 +157,18 @@ def of_all(
     found += _gear(body, states)
     unknown = OwnUnknowns.of(recording.sensors)
     if unknown.names:
-        found.append((unknown, _start_of(unknown, World(body, recording.rig), steps, states)))
-    return _together(World(body, recording.rig), found)
+        found.append((unknown, _start_of(unknown, kinds.World(body, recording.rig), steps, states)))
+    return _together(kinds.World(body, recording.rig), found)
 
 
-def _gear(body: Body, states: Sequence[BodyState]) -> list[tuple[Parameters, NDArray]]:
+def _gear(body: Body, states: Sequence[BodyState]) -> list[tuple[kinds.Parameters, NDArray]]:
     """The unknown gear of a body and where its fit begins; none where all is known."""
-    gear = Gear(body)
+    gear = kinds.Gear(body)
     return [(gear, gear.start(states))] if gear.names else []
 
 
 def _start_of(
-    unknown: OwnUnknowns, world: World, steps: Sequence[Sequence[Measurement]], states: Sequence[BodyState]
+    unknown: OwnUnknowns, world: kinds.World, steps: Sequence[Sequence[Measurement]], states: Sequence[BodyState]
 ) -> NDArray:
     """(p,) values at which the poses leave the least absolute residuals: a robust loss finds nothing from far away."""
     worlds, prior, theta = Worlds(world, (unknown,)), unknown.information, unknown.mean
@@ -196,18 +187,18 @@ def _start_of(
     return theta
 
 
-def _together(world: World, found: Sequence[tuple[Parameters, NDArray]]) -> Unknowns | None:
+def _together(world: kinds.World, found: Sequence[tuple[kinds.Parameters, NDArray]]) -> Unknowns | None:
     if not found:
         return None
     return Unknowns(world, tuple(p for p, _ in found), np.concatenate([values for _, values in found]))
 
 
-def _keypoint_offsets(generic: Body, subject: Subject) -> dict[str, tuple[Parameters, NDArray]]:
+def _keypoint_offsets(generic: Body, subject: Subject) -> dict[str, tuple[kinds.Parameters, NDArray]]:
     """Of every keypoint set its offsets, as far as the keypoints' own fit found that they may be, and where it did."""
-    scaled, out = generic.scaled(subject.scales), dict[str, tuple[Parameters, NDArray]]()
+    scaled, out = generic.scaled(subject.scales), dict[str, tuple[kinds.Parameters, NDArray]]()
     for one in subject.fit.parameters if subject.fit is not None else ():
-        if not isinstance(one, PointOffsets):
+        if not isinstance(one, kinds.PointOffsets):
             continue
-        name, offsets = one.name, PointOffsets(generic, one.name, one.std)
+        name, offsets = one.name, kinds.PointOffsets(generic, one.name, one.std)
         out[name] = offsets, offsets.values_of(subject.body.keypoints(name).points - scaled.keypoints(name).points)
     return out

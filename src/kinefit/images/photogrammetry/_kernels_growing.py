@@ -5,19 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kinefit._jit import jit
-from kinefit.images.photogrammetry.matching._kernels_matching import (
-    CORRELATION,
-    DIVERGED,
-    FOUND,
-    NOT_VISITED,
-    OUTSIDE_IMAGE,
-    STATUS,
-    A,
-    U,
-    V,
-    match_point,
-    room,
-)
+from kinefit.images.photogrammetry.matching import _kernels_matching as matching
 
 
 @jit
@@ -61,25 +49,25 @@ def grow(first, second, at, columns, seeds, starts, halves, steps, tolerance, sh
     neighbour's prediction. Points with NaN are skipped. Fills out (N, 15); returns the number of attempts.
     """
     count = at.shape[0]
-    f, fx, fy, rows, m, b, kept = room(halves)
+    f, fx, fy, rows, m, b, kept = matching.room(halves)
     keys, items, size = np.empty(count + 1), np.empty(count + 1, np.int64), 0
     start, tried = np.empty(6), 0
     for k in range(count):
         out[k, :] = np.nan
-        out[k, STATUS] = NOT_VISITED
+        out[k, matching.STATUS] = matching.NOT_VISITED
     for s in range(seeds.shape[0]):
         k = seeds[s]
-        if out[k, STATUS] == FOUND or not (abs(at[k, 0]) < np.inf and abs(at[k, 1]) < np.inf):
+        if out[k, matching.STATUS] == matching.FOUND or not (abs(at[k, 0]) < np.inf and abs(at[k, 1]) < np.inf):
             continue
-        match_point(
+        matching.match_point(
             first, second, at[k, 0], at[k, 1], starts[s], halves[k], steps, tolerance, share, own,
             f, fx, fy, rows, m, b, kept, out[k],
         )  # fmt: skip
         tried += 1
-        if out[k, STATUS] == FOUND and out[k, CORRELATION] >= least:
-            size = push(keys, items, size, out[k, CORRELATION], k)
-        elif out[k, STATUS] == FOUND:
-            out[k, STATUS] = DIVERGED
+        if out[k, matching.STATUS] == matching.FOUND and out[k, matching.CORRELATION] >= least:
+            size = push(keys, items, size, out[k, matching.CORRELATION], k)
+        elif out[k, matching.STATUS] == matching.FOUND:
+            out[k, matching.STATUS] = matching.DIVERGED
     while size > 0:
         k, size = pop(keys, items, size)
         for side in range(4):
@@ -93,25 +81,25 @@ def grow(first, second, at, columns, seeds, starts, halves, steps, tolerance, sh
                 other = k + columns
             else:
                 continue
-            state = out[other, STATUS]
-            if not (state == NOT_VISITED or state == DIVERGED or state == OUTSIDE_IMAGE):
+            state = out[other, matching.STATUS]
+            if not (state == matching.NOT_VISITED or state == matching.DIVERGED or state == matching.OUTSIDE_IMAGE):
                 continue
             x, y = at[other, 0] - at[k, 0], at[other, 1] - at[k, 1]
             if not (abs(x) < np.inf and abs(y) < np.inf):
                 continue
-            start[0] = out[k, U] + out[k, A] * x + out[k, A + 1] * y
-            start[1] = out[k, V] + out[k, A + 2] * x + out[k, A + 3] * y
+            start[0] = out[k, matching.U] + out[k, matching.A] * x + out[k, matching.A + 1] * y
+            start[1] = out[k, matching.V] + out[k, matching.A + 2] * x + out[k, matching.A + 3] * y
             for i in range(4):
-                start[2 + i] = out[k, A + i]
-            match_point(
+                start[2 + i] = out[k, matching.A + i]
+            matching.match_point(
                 first, second, at[other, 0], at[other, 1], start, halves[other], steps, tolerance, share, own,
                 f, fx, fy, rows, m, b, kept, out[other],
             )  # fmt: skip
             tried += 1
-            if out[other, STATUS] == FOUND:
-                du, dv = out[other, U] - start[0], out[other, V] - start[1]
-                if out[other, CORRELATION] >= least and du * du + dv * dv <= reach * reach:
-                    size = push(keys, items, size, out[other, CORRELATION], other)
+            if out[other, matching.STATUS] == matching.FOUND:
+                du, dv = out[other, matching.U] - start[0], out[other, matching.V] - start[1]
+                if out[other, matching.CORRELATION] >= least and du * du + dv * dv <= reach * reach:
+                    size = push(keys, items, size, out[other, matching.CORRELATION], other)
                 else:
-                    out[other, STATUS] = DIVERGED
+                    out[other, matching.STATUS] = matching.DIVERGED
     return tried

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.images.photogrammetry.matching import _kernels_spline as kernels
+from kinefit.images.photogrammetry.matching import _kernels_matching as kernels
 
 _NOISE_MASK = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]]) / 6.0
 _MIN_SIDE_PX = 16  # of an image: two windows' margins

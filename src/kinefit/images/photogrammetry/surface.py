@@ -1,21 +1,27 @@
-"""Measure a surface from images of one time: matching, intersection, standard deviations and a mesh."""
+"""Measure a surface from images of one time: matching, intersection, standard deviations and a mesh.
+
+Measure a surface in several states of load, each matched with the first state or with the one before.
+
+Plane displacement and strain of a flat surface from one camera that faces it, without calibration.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import CalibrationError, ObservationError
+from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
+from kinefit.images.photogrammetry import least_squares_matching as matching
 from kinefit.images.photogrammetry.intersection import intersect
-from kinefit.images.photogrammetry.least_squares_matching import WINDOW, Matches, half_sides
 from kinefit.images.photogrammetry.matching.multi_image import match_along_rays, search_box
-from kinefit.images.photogrammetry.region_growing import MIN_CORRELATION, Grid, Seeds, grow
-from kinefit.images.photogrammetry.seeding.unaided import grow_between
+from kinefit.images.photogrammetry.seeding.unaided import grow_between, grow_over_time, grow_through
 from kinefit.images.photogrammetry.spline_image import SplineImage
+from kinefit.images.photogrammetry.strain import Strain, grid_step, scatter, strain
 
 _EXACT_VARIANCE = 1e-6  # [px²] of the template's position, which is exact by definition
 _MIN_POINTS = 3  # of a surface
@@ -42,7 +48,7 @@ class MeasuredSurface:
     deformation : (N, C - 1, 2, 2) maps an offset in the first image to each other image
     """
 
-    grid: Grid
+    grid: matching.Grid
     cameras: tuple[str, ...]
     x_world: NDArray
     covariance: NDArray
@@ -97,11 +103,11 @@ def check_images(rig: Rig, images: Sequence[SplineImage], fewest: int = 2) -> No
 def measure(
     rig: Rig,
     images: Sequence[SplineImage],
-    grid: Grid,
+    grid: matching.Grid,
     *,
-    seeds: Sequence[Seeds] | None = None,
-    window: int | ArrayLike = WINDOW,
-    least: float = MIN_CORRELATION,
+    seeds: Sequence[matching.Seeds] | None = None,
+    window: int | ArrayLike = matching.WINDOW,
+    least: float = matching.MIN_CORRELATION,
     constrained: bool | None = None,
 ) -> MeasuredSurface:
     """Measure a surface from the images of two or more cameras at one time.
@@ -124,13 +130,13 @@ def measure(
     """
     check_images(rig, images)
     first = images[0]
-    half_sides(window, len(grid.points))
+    matching.half_sides(window, len(grid.points))
     if seeds is not None and len(seeds) != len(rig) - 1:
         raise ObservationError(f"seeds of {len(seeds)} cameras", remedy=f"Give those of the other {len(rig) - 1}.")
     found = []
     for k, (camera, image) in enumerate(zip(rig.cameras[1:], images[1:])):
         if seeds is not None:
-            found.append(grow(first, image, grid, seeds[k], window=window, least=least))
+            found.append(matching.grow(first, image, grid, seeds[k], window=window, least=least))
         else:
             found.append(grow_between(first, image, (rig.cameras[0], camera), grid, window=window, least=least))
         if found[-1].found.sum() < _MIN_POINTS:
@@ -165,7 +171,7 @@ def _raise_unmatched(first: SplineImage, camera: str) -> None:
     raise ObservationError(problem, place=f"camera {camera}", remedy=remedy)
 
 
-def reject_repeated_texture(first: SplineImage, second: SplineImage, found: Matches, place: str) -> None:
+def reject_repeated_texture(first: SplineImage, second: SplineImage, found: matching.Matches, place: str) -> None:
     """Raise an error if the texture repeats nearby, so that matches are ambiguous.
 
     Windows of 31 px around 20 points are searched within two windows of their matches. The texture repeats if most of
@@ -187,7 +193,9 @@ def reject_repeated_texture(first: SplineImage, second: SplineImage, found: Matc
         raise ObservationError(problem, place=place, remedy="Give seeds by hand, or use another texture.")
 
 
-def from_matches(rig: Rig, grid: Grid, own: Matches | None, others: Sequence[Matches]) -> MeasuredSurface:
+def from_matches(
+    rig: Rig, grid: matching.Grid, own: matching.Matches | None, others: Sequence[matching.Matches]
+) -> MeasuredSurface:
     """Intersect the matches of a grid and reject those with an outlying parallax.
 
     Parameters
@@ -226,10 +234,10 @@ def match_rays(
     rig: Rig,
     images: Sequence[SplineImage],
     surface: MeasuredSurface,
-    found: Sequence[Matches],
+    found: Sequence[matching.Matches],
     *,
-    window: int | ArrayLike = WINDOW,
-    least: float = MIN_CORRELATION,
+    window: int | ArrayLike = matching.WINDOW,
+    least: float = matching.MIN_CORRELATION,
 ) -> MeasuredSurface:
     """Match all images of a surface jointly along the first camera's rays, starting at the measured points.
 
@@ -261,3 +269,184 @@ def _lateral_covariance(rig: Rig, rays: NDArray, distance: NDArray) -> NDArray:
     focal = rig.cameras[0].matrix[0, 0]
     lateral = np.eye(3) - np.einsum("ni,nj->nij", rays, rays)
     return np.einsum("n,nij->nij", _EXACT_VARIANCE * (distance / focal) ** 2, lateral)
+
+
+Progress = Callable[[str, int, int], None]
+
+
+def measure_states(
+    rig: Rig,
+    states: Sequence[Sequence[SplineImage]],
+    grid: matching.Grid,
+    *,
+    seeds: Sequence[matching.Seeds] | None = None,
+    window: int | ArrayLike = matching.WINDOW,
+    least: float = matching.MIN_CORRELATION,
+    incremental: bool = False,
+    progress: Progress | None = None,
+) -> list[MeasuredSurface]:
+    """Measure the same points of a surface in each of several states.
+
+    Parameters
+    ----------
+    states : for each state the images of all cameras, in the rig's order; accessed once each, in order
+    grid, seeds, window [px], least : as in `measure`, for the first state
+    incremental : False: match every image with the first one of the first camera, so that errors do not accumulate.
+        True: match with the state before, for motions that change the image too much
+    progress : (what, done, total) -> None
+
+    Returns
+    -------
+    list of MeasuredSurface
+        Rows (N,) are the same material points in all states; NaN where one is lost.
+
+    Raises
+    ------
+    ObservationError, CalibrationError
+        There is no state; or as `measure`.
+    """
+    if not len(states):
+        raise ObservationError("no state", remedy="Give the images of one time, or more.")
+    first = states[0]
+    check_images(rig, first)
+    out = [measure(rig, first, grid, seeds=seeds, window=window, least=least)]
+    template, places = first[0], grid
+    for k in range(1, len(states)):
+        if progress is not None:
+            progress("states", k, len(states))
+        images = states[k]
+        check_images(rig, images)
+        own_matches = grow_over_time(template, images[0], places, window=window, least=least)
+        current_grid, others = replace(places, points=own_matches.uv), list[matching.Matches]()
+        for image, camera in zip(images[1:], rig.cameras[1:]):
+            pair = rig.cameras[0], camera
+            if incremental:
+                others.append(grow_between(images[0], image, pair, current_grid, window=window, least=least))
+            else:
+                other = grow_through(template, images[0], image, pair, places, own_matches, window=window, least=least)
+                others.append(other)
+        out.append(from_matches(rig, grid, own_matches, others))
+        if incremental:
+            template, places = images[0], current_grid
+    if progress is not None:
+        progress("states", len(states), len(states))
+    return out
+
+
+def surface_strain(reference: MeasuredSurface, state: MeasuredSurface, gauge: float, window: int = 0) -> Strain:
+    """Green-Lagrange strain between two states of a surface.
+
+    Parameters
+    ----------
+    gauge : [m] gauge length
+    window : [px] side of the matching windows
+    """
+    displacement = state.x_world - reference.x_world
+    return strain(reference.x_world, displacement, reference.grid.columns, gauge=gauge, window=_side(reference, window))
+
+
+def displacement_std(reference: MeasuredSurface, state: MeasuredSurface, window: int) -> NDArray:
+    """(N, 3) [m] standard deviations of displacements, estimated from their scatter among neighbours.
+
+    With too few neighbours, they follow from the matches of both states. `window`: [px] side of the matching windows.
+    """
+    spread = scatter(
+        reference.x_world, state.x_world - reference.x_world, reference.grid.columns, window=_side(reference, window)
+    )  # fmt: skip
+    return np.where(np.isfinite(spread), spread, np.hypot(reference.std, state.std))
+
+
+def _side(surface: MeasuredSurface, window: int) -> float:
+    """[m] approximate side of a matching window of `window` [px]."""
+    step = grid_step(surface.x_world, surface.grid.columns)
+    return window * step / surface.grid.step if np.isfinite(step) else 0.0
+
+
+def rigid_motion(reference: NDArray, state: NDArray) -> tuple[NDArray, NDArray]:
+    """Least-squares rigid motion from points `reference` (N, 3) [m] to `state` (N, 3) [m], and the residuals.
+
+    Returns
+    -------
+    T_state_reference : (4, 4)
+    residual : (N, 3) [m]; NaN where a point is missing
+
+    Raises
+    ------
+    ObservationError
+        Fewer than three points are in both states.
+    """
+    common = np.isfinite(reference).all(axis=1) & np.isfinite(state).all(axis=1)
+    if common.sum() < 3:
+        raise ObservationError(f"{common.sum()} points in both states", remedy="Three are needed.")
+    T = se3.aligned(reference[common], state[common])
+    return T, state - se3.apply(T, reference)
+
+
+def measure_flat(
+    states: Sequence[SplineImage],
+    grid: matching.Grid,
+    pixel: float,
+    *,
+    window: int | ArrayLike = matching.WINDOW,
+    least: float = matching.MIN_CORRELATION,
+    incremental: bool = False,
+) -> list[MeasuredSurface]:
+    """Measure points of a flat surface in several states by one camera whose axis is normal to it.
+
+    Distance and lens must not change: a motion towards the camera by a thousandth of the distance gives a strain of
+    1e-3. Lens distortion is not corrected.
+
+    Parameters
+    ----------
+    states : two or more images of one size
+    grid : of the first image
+    pixel : [m] size of a pixel on the surface
+    window : odd side [px] of the matching windows, of all or of each
+    least : least correlation, 0 to 1, of a match
+    incremental : match each image with the one before, not the first
+
+    Returns
+    -------
+    list of MeasuredSurface
+        x_world (N, 3) [m]: x to the right, y up, z = 0; the origin is the corner of the first image
+
+    Raises
+    ------
+    ObservationError
+        Fewer than two images, different sizes, a pixel that is not positive, no match, or texture that repeats.
+    """
+    if len(states) < 2 or not 0 < pixel < np.inf:
+        problem = f"{len(states)} images, a pixel of {pixel} m"
+        raise ObservationError(problem, remedy="Give one image before and one or more after, and a positive length.")
+    first, size = states[0], states[0].size
+    current_grid, out = grid, [_surface(grid, None, pixel)]
+    for k in range(1, len(states)):
+        image = states[k]
+        if image.size != size:
+            problem = f"image {k} has {image.size[0]}x{image.size[1]} px, the first {size[0]}x{size[1]}"
+            raise ObservationError(problem, remedy="Give images of one camera.")
+        found = grow_over_time(first, image, current_grid, window=window, least=least)
+        if not found.found.any():
+            reject_untextured(first, "first image")
+            remedy = "Use better light, a larger window, or images of states between."
+            raise ObservationError(f"no point of the first image is found in image {k}", remedy=remedy)
+        reject_repeated_texture(first, image, found, f"image {k}")
+        out.append(_surface(grid, found, pixel))
+        if incremental:
+            first, current_grid = image, replace(grid, points=found.uv)
+    return out
+
+
+def _surface(grid: matching.Grid, found: matching.Matches | None, pixel: float) -> MeasuredSurface:
+    """The surface of the first image, or of the matches in a later one."""
+    uv: NDArray = grid.points if found is None else found.uv
+    exact = np.where(grid.inside[:, None, None], _EXACT_VARIANCE * np.eye(2), np.nan)
+    axes = np.diag([pixel, -pixel])
+    covariance = np.zeros((len(uv), 3, 3))
+    covariance[:, :2, :2] = axes @ (exact if found is None else found.covariance) @ axes
+    x = np.column_stack([uv @ axes, np.where(np.isfinite(uv[:, 0]), 0.0, np.nan)])
+    correlation = np.where(grid.inside, 1.0, np.nan) if found is None else found.correlation
+    return MeasuredSurface(
+        grid, ("image",), x, covariance, uv[:, None], correlation, np.where(np.isfinite(correlation), 0.0, np.nan),
+        np.zeros((len(uv), 0, 2, 2)),
+    )  # fmt: skip

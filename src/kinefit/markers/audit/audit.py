@@ -22,7 +22,7 @@ from kinefit.markers.model.learn import learn_model
 from kinefit.markers.model.model import MarkerModel
 from kinefit.markers.take.consistency import Consistency
 from kinefit.observations import Markers
-from kinefit.solving.rigid_clusters import nan_median
+from kinefit.solving.functional_joints import nan_median
 
 MAX_PARTNERS = 6
 """Other markers whose distances judge a label: those with the least deviation."""

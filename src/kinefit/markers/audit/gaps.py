@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.markers.audit.swaps import interpolate_spans, place_costs
-from kinefit.solving.rigid_clusters import nan_median, rigid_frames
+from kinefit.solving.functional_joints import nan_median, rigid_frames
 
 MAX_ISLAND_FRAMES = 10
 """Longest piece of a trajectory between two gaps that is judged as a whole; of longer ones only the ends are."""

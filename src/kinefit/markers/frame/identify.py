@@ -15,11 +15,18 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._arguments import checked, shaped
 from kinefit.markers.frame._kernels_evidence import place_joint
 from kinefit.markers.frame._kernels_posture import turn_costs
-from kinefit.markers.frame.beliefs import Beliefs, Identification
-from kinefit.markers.frame.explain import Solution, explain, gain_of, refine, solution
-from kinefit.markers.frame.polish import MAX_RIVAL_COST, labels_of, rivals
+from kinefit.markers.frame.explain import (
+    MAX_RIVAL_COST,
+    Solution,
+    explain,
+    gain_of,
+    labels_of,
+    refine,
+    rivals,
+    solution,
+)
 from kinefit.markers.frame.search import LabelSearch, UnlabelledFrame
-from kinefit.markers.frame.tables import segment_tables
+from kinefit.markers.frame.tables import Beliefs, Identification, segment_tables
 from kinefit.markers.model.model import MarkerModel
 
 OUTLIER_SHARE = 0.05

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from kinefit.markers.frame._kernels_evidence import place_joint
 from kinefit.markers.frame._kernels_identify import range_cost
 from kinefit.markers.frame._kernels_nodes import cheapest_compatible, expand_segment
-from kinefit.markers.frame.beliefs import Beliefs
-from kinefit.markers.frame.tables import SegmentTable
+from kinefit.markers.frame.tables import Beliefs, SegmentTable
 
 MAX_JOINT_SIGMA = 0.15
 """[m] a joint that the parent places with a larger standard deviation does not constrain the child."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from kinefit.bodies.marker_sets import GIVE, RANGE, bare
 from kinefit.markers.model.from_frame import Skeleton
 from kinefit.markers.model.rigid import joint_residual
-from kinefit.solving.rigid_clusters import local, nan_median, rigid_frames, shape_of
+from kinefit.solving.functional_joints import local, nan_median, rigid_frames, shape_of
 
 MAX_SEGMENT_SIGMA = 0.012
 """[m] largest deviation of the distances within a segment: twice that of the catalogue's markers (0.004 m at each end).

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from kinefit.geometry.se3 import exp_so3, log_so3, nearest_rotation
 from kinefit.markers.model.model import MarkerJoint
-from kinefit.solving.rigid_clusters import local, nan_median
+from kinefit.solving.functional_joints import local, nan_median
 
 SECOND_AXIS_RATIO = 0.35
 """Range of a ball joint about its second axis over that about its first: a hip flexes through 130 degrees and spreads

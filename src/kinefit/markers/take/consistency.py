@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit.findings import runs_of
 from kinefit.markers.model.model import MarkerModel
-from kinefit.solving.rigid_clusters import rigid_frames
+from kinefit.solving.functional_joints import rigid_frames
 
 MIN_SIGMA = 0.004
 """[m] lower bound of the standard deviation of a distance: skin and measurement noise."""

@@ -13,12 +13,11 @@ from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import find_marker_set
 from kinefit.errors import ObservationError, located
 from kinefit.findings import runs_of
-from kinefit.markers.frame.beliefs import Beliefs, Identification
 from kinefit.markers.frame.identify import IdentifySettings, identify
+from kinefit.markers.frame.tables import Beliefs, Identification
 from kinefit.markers.model.model import MarkerModel, load_model
 from kinefit.markers.take.consistency import Consistency, fill_gaps
-from kinefit.markers.take.naming import INLIER_SIGMAS, OUTLIER_SIGMAS, Naming, Step
-from kinefit.markers.take.votes import find_pieces
+from kinefit.markers.take.naming import INLIER_SIGMAS, OUTLIER_SIGMAS, Naming, Step, find_pieces
 from kinefit.observations import Markers
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations

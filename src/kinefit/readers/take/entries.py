@@ -272,7 +272,7 @@ class TakeHead:
     body : str
         Name in the catalogue, or absolute path of a body file.
     bands : {joint: float [m]} or None
-        Joints by elastic bands in place of hard ones, see `correspondences.bands.with_bands`; "all": all others.
+        Joints by elastic bands in place of hard ones, see `correspondences.closures.with_bands`; "all": all others.
     height : float [m] or None
         Stature of the person, as a first guess.
     mass : float [kg] or None

@@ -14,8 +14,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import inverse
 from kinefit.rigs.board.bundle import BoardBundle, adjust_boards
 from kinefit.rigs.board.detection import Board, CameraViews
-from kinefit.rigs.board.extrinsics import Placed, place_cameras
-from kinefit.rigs.board.intrinsics import Interiors, calibrate_interiors, coverage, known_camera
+from kinefit.rigs.board.extrinsics import Interiors, Placed, calibrate_interiors, coverage, known_camera, place_cameras
 
 _ADVISED_VIEWS = 15  # of one camera; with fewer the distortion is poorly determined
 _ADVISED_SHARED = 8  # frames of a pair

@@ -23,7 +23,7 @@ from kinefit.readers.calibration.read import found_notes
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.videos import TakePictures
-from kinefit.rigs.diagnostics import cameras, changes, frozen, images, lenient, mistakes, person, rig, timing
+from kinefit.rigs.diagnostics import cameras, changes, images, lenient, mistakes, person, rig, timing
 from kinefit.rigs.diagnostics.cameras import CameraBias
 from kinefit.rigs.diagnostics.rig import CameraCoverage
 from kinefit.rigs.diagnostics.timing import TimeOffsets
@@ -205,7 +205,7 @@ def _files(c: Checked) -> list[Finding]:
 
 
 def _frozen(c: Checked) -> list[Finding]:
-    c.observations, found = frozen.without_frozen(c.observations)
+    c.observations, found = images.without_frozen(c.observations)
     return found
 
 

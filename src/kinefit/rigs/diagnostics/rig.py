@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.findings import Finding, Severity, listed
-from kinefit.fitting.multiview.turned import turned_cameras
-from kinefit.fitting.multiview.views import KeypointViews
+from kinefit.fitting.multiview.views import KeypointViews, turned_cameras
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 

@@ -1,33 +1,218 @@
-"""Where cameras stand, from the people in view alone: their own keypoints are the calibration object."""
+"""Where cameras stand, from the people in view alone: their own keypoints are the calibration object.
+
+Which way is up and where the floor is, from a person who stands and walks on it.
+
+A first rig from pixels that cameras have in common, with no pose known.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked, renamed
 from kinefit.bodies import Body, PointSet
 from kinefit.bodies.limbs import rigid_pairs
+from kinefit.bodies.motion import rotation_between_up
 from kinefit.errors import CalibrationError
 from kinefit.fitting.multiview.association import person_records
+from kinefit.fitting.smoothing.foot_contacts import fit_plane, upward
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.lines import triangulate, triangulate_robust
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
-from kinefit.rigs.people.first_rig import first_rig
-from kinefit.rigs.people.floor import settled
 from kinefit.rigs.people.skeletons import first_cameras, in_step, steady_person
 from kinefit.rigs.refine.gauge import resized
 from kinefit.rigs.refine.refine import Length, check_input, length_of, prior_sigma, refine_from
-from kinefit.rigs.refine.result import Refinement
-from kinefit.rigs.refine.sightings import PersonSighting, PersonTrial, Progress
+from kinefit.rigs.refine.result import PersonSighting, PersonTrial, Progress, Refinement
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solving.bundle.adjust import BundleState, adjust
-from kinefit.solving.bundle.body_bundle import PointProblem
 from kinefit.solving.bundle.cameras import FOCAL, TIME, CameraPrior, PointPixels
+from kinefit.solving.bundle.shape import PointProblem
+
+_MIN_COMMON_KEYPOINTS = 50  # keypoints that two cameras must have in common
+_MAX_KEYPOINTS = 4000  # of them that take part
+_MIN_RAY_ANGLE = np.radians(3.0)  # angle between two cameras' rays below which they tell no distance
+_MAX_INLIER_SIGMAS = 3.0  # standard deviations of a keypoint that agrees
+
+
+def first_rig(rig: Rig, uv: NDArray, sigma: float) -> Rig:
+    """Poses of all cameras of a rig up to place, turn and scale; the poses it has are not used.
+
+    The pair with the most keypoints that agree, seen from the most different sides, comes first (essential matrix by
+    consensus: D. Nister, An efficient solution to the five-point relative pose problem, 2004); then, one by one, the
+    camera that sees the most of the points known so far (V. Lepetit et al., EPnP, 2009).
+
+    Parameters
+    ----------
+    uv : (P, C, 2) [px] of points that one or more cameras saw, NaN where unseen.
+    sigma : float [px] standard deviation of a pixel.
+
+    Raises
+    ------
+    CalibrationError
+        Too few points in common, no pair of cameras far enough apart, or a camera that agrees with no other.
+    """
+    flat = np.stack([_normalised(camera, uv[:, c]) for c, camera in enumerate(rig)], axis=1)
+    pairs = {
+        (i, j): found
+        for i in range(len(rig)) for j in range(i + 1, len(rig))
+        if (found := _relative_pose(rig, flat, i, j, sigma)) is not None
+    }
+    if not pairs:
+        raise CalibrationError(
+            "no two cameras see enough of the same person from different sides",
+            remedy="Place the cameras 20 degrees apart or more, and record someone who moves about in view of all.",
+        )
+    first = max(pairs, key=lambda pair: pairs[pair][1])
+    poses: dict[int, NDArray] = {first[0]: np.eye(4), first[1]: pairs[first][0]}
+    while len(poses) < len(rig):
+        x = _points(rig, poses, uv, sigma)
+        trials = {c: _laid_on(rig.cameras[c], flat[:, c], x, sigma) for c in range(len(rig)) if c not in poses}
+        best = max(trials, key=lambda c: trials[c][1])
+        if trials[best][1] < _MIN_COMMON_KEYPOINTS:
+            names = ", ".join(rig.names[c] for c in trials)
+            raise CalibrationError(
+                f"the keypoints of {names} agree with no other camera", place=f"camera {rig.names[best]}",
+                remedy="Check that its intrinsics are right, and that it is in step and sees the same person.",
+            )
+        poses[best] = trials[best][0]
+    return Rig(tuple(camera.with_pose(poses[c]) for c, camera in enumerate(rig)))
+
+
+def _normalised(camera: Camera, uv: NDArray) -> NDArray:
+    """(P, 2) undistorted, on the plane at distance 1; NaN where unseen."""
+    ray = camera.with_pose(np.eye(4)).ray(uv)
+    return np.where(ray[:, 2:] > 1e-6, ray[:, :2] / np.where(ray[:, 2:] > 1e-6, ray[:, 2:], 1.0), np.nan)
+
+
+def _thinned(index: NDArray) -> NDArray:
+    return index[np.unique(np.linspace(0, len(index) - 1, min(len(index), _MAX_KEYPOINTS)).astype(int))]
+
+
+def _relative_pose(rig: Rig, flat: NDArray, i: int, j: int, sigma: float) -> tuple[NDArray, float] | None:
+    """T_j_i (4, 4), translation of length 1, and how good a start the pair is; None where it is none."""
+    both = _thinned(np.flatnonzero(np.isfinite(flat[:, [i, j]]).all(axis=(1, 2))))
+    if len(both) < _MIN_COMMON_KEYPOINTS:
+        return None
+    a, b = np.ascontiguousarray(flat[both, i]), np.ascontiguousarray(flat[both, j])
+    focal = np.mean([rig.cameras[c].matrix[0, 0] for c in (i, j)])
+    cv2.setRNGSeed(0)
+    E, mask = cv2.findEssentialMat(
+        a, b, np.eye(3), method=cv2.RANSAC, prob=0.99999, threshold=_MAX_INLIER_SIGMAS * sigma / focal, maxIters=3000
+    )
+    if E is None or E.shape != (3, 3):
+        return None
+    count, R, t, mask = cv2.recoverPose(E, a, b, np.eye(3), mask=mask)
+    if count < _MIN_COMMON_KEYPOINTS:
+        return None
+    T = se3.transform(R, t.ravel())
+    agreed = mask.ravel() > 0
+    rays = np.stack([np.append(p, 1.0) for p in a[agreed]]), np.stack([np.append(p, 1.0) for p in b[agreed]]) @ R
+    cosine = np.sum(rays[0] * rays[1], axis=1) / np.linalg.norm(rays[0], axis=1) / np.linalg.norm(rays[1], axis=1)
+    angle = float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    return (T, count * np.sin(angle)) if _MIN_RAY_ANGLE < angle < np.pi - _MIN_RAY_ANGLE else None
+
+
+def _points(rig: Rig, poses: dict[int, NDArray], uv: NDArray, sigma: float) -> NDArray:
+    """(P, 3) points on which two of the cameras known so far agree, NaN elsewhere."""
+    known = sorted(poses)
+    part = Rig(tuple(rig.cameras[c].with_pose(poses[c]) for c in known))
+    return triangulate_robust(part, uv[:, known], max_residual_px=_MAX_INLIER_SIGMAS * sigma)[0]
+
+
+def _laid_on(camera: Camera, flat: NDArray, x: NDArray, sigma: float) -> tuple[NDArray, int]:
+    """T_camera_world (4, 4) of a camera that sees points x (P, 3), and how many agree."""
+    both = _thinned(np.flatnonzero(np.isfinite(flat).all(axis=1) & np.isfinite(x).all(axis=1)))
+    if len(both) < _MIN_COMMON_KEYPOINTS:
+        return np.eye(4), 0
+    cv2.setRNGSeed(0)
+    ok, turn, shift, inliers = cv2.solvePnPRansac(
+        np.ascontiguousarray(x[both]), np.ascontiguousarray(flat[both]), np.eye(3), None, iterationsCount=1000,
+        reprojectionError=_MAX_INLIER_SIGMAS * sigma / camera.matrix[0, 0], confidence=0.9999, flags=cv2.SOLVEPNP_EPNP,
+    )
+    if not ok or inliers is None or len(inliers) < _MIN_COMMON_KEYPOINTS:
+        return np.eye(4), 0
+    chosen = both[inliers.ravel()]
+    turn, shift = cv2.solvePnPRefineLM(x[chosen], flat[chosen], np.eye(3), None, turn, shift)
+    return se3.transform(se3.exp_so3(turn.ravel()), shift.ravel()), len(chosen)
+
+
+_MAX_FOOT_HEIGHT_M = 0.12  # [m] points this little above the soles are the foot's
+_FLAT = 0.02  # [m] how well a foot on the floor tells its height
+_STEPS = 20.0  # looks at the floor that are news, over a take
+_MAX_SUPPORT_DIFFERENCE_M = 0.03  # [m] the lower foot bears more than one this much higher
+_STANCE_PERCENT = 20  # per cent of frames in which the lower foot surely stands
+
+
+def settled(
+    rig: Rig, x_world: NDArray, rest_height: NDArray, *, balance: NDArray | None = None, up: str = "z"
+) -> Rig:
+    """The rig in a world that stands on the floor: origin below the person's mean place, height zero on the floor.
+
+    Up is the mean direction from the standing foot to the centre of mass: who does not fall keeps one above the other.
+    Then the floor under the feet corrects it where they walked about. For z up, x points to the first camera.
+
+    Parameters
+    ----------
+    x_world : (F, K, 3) [m] points of the person, NaN where unknown.
+    rest_height : (K,) [m] height of each point above the soles when standing.
+    balance : (F, 3) [m] centre of mass; default: unknown, and up is how the whole body stands.
+    up : str, vertical axis of the result.
+    """
+    R = _upright(upward(x_world, rest_height))
+    for _ in range(3 if balance is not None else 0):
+        R = _upright(R.T @ np.nanmean(balance @ R.T - _stand(x_world @ R.T, rest_height), axis=0))
+    for _ in range(3):
+        low, height = _soles(x_world @ R.T, rest_height)
+        if len(low) >= 3:
+            fit, _ = fit_plane(low, height, np.full(len(low), _STEPS / len(low) / _FLAT**2))
+            R = _upright(R.T @ np.append(-fit[:2], 1.0))
+    x = x_world @ R.T
+    _, height = _soles(x, rest_height)
+    ground = float(np.percentile(height, _STANCE_PERCENT)) if len(height) else float(np.nanmin(x[..., 2]))
+    middle = np.nanmedian(x.reshape(-1, 3), axis=0)
+    towards = R @ rig.cameras[0].centre_world - middle
+    turn = se3.exp_so3(np.array([0.0, 0.0, -np.arctan2(towards[1], towards[0])]))
+    T = se3.transform(turn @ R, turn @ -np.array([middle[0], middle[1], ground]))
+    return rig.moved(se3.transform(rotation_between_up("z", up), np.zeros(3)) @ T)
+
+
+def _upright(up: NDArray) -> NDArray:
+    """(3, 3) smallest rotation that takes a direction to z."""
+    return se3.shortest_turn(up, np.array([0.0, 0.0, 1.0]))
+
+
+def _stand(x: NDArray, rest_height: NDArray) -> NDArray:
+    """(F, 3) where the person stands: the feet's points, the lower ones more; NaN where none is known."""
+    feet = np.flatnonzero(rest_height < _MAX_FOOT_HEIGHT_M)
+    height = x[:, feet, 2] - rest_height[feet]
+    low = np.min(np.where(np.isfinite(height), height, np.inf), axis=1, keepdims=True, initial=np.inf)
+    above = np.where(np.isfinite(height), height - low, 0.0)
+    weight = np.where(np.isfinite(height), np.exp(-above / _MAX_SUPPORT_DIFFERENCE_M), 0.0)
+    total = weight.sum(axis=1, keepdims=True)
+    mean = np.einsum("fk,fkd->fd", weight, np.nan_to_num(x[:, feet])) / np.where(total > 0, total, 1.0)
+    return np.where(total > 0, mean, np.nan)
+
+
+def _soles(x: NDArray, rest_height: NDArray) -> tuple[NDArray, NDArray]:
+    """Horizontal place (M, 2) and height (M,) of the lower foot's sole in every frame in which it hardly moves."""
+    feet = np.flatnonzero(rest_height < _MAX_FOOT_HEIGHT_M)
+    at = x[:, feet] - np.array([0.0, 0.0, 1.0]) * rest_height[feet, None]
+    known = np.isfinite(at).all(axis=(1, 2)) if len(feet) else np.zeros(len(x), bool)
+    at = at[known]
+    if len(at) < 2:
+        return np.zeros((0, 2)), np.zeros(0)
+    lowest = np.argmin(at[..., 2], axis=1)
+    point = at[np.arange(len(at)), lowest]
+    move = np.linalg.norm(np.gradient(at, axis=0), axis=-1)[np.arange(len(at)), lowest]
+    still = move <= np.median(move)
+    return point[still, :2], point[still, 2]
+
 
 _MIN_CONFIDENCE = 0.3  # confidence of a keypoint that takes part in the start
 _MAX_POINTS = 2500  # points in space of the start

@@ -14,21 +14,11 @@ from kinefit.errors import CalibrationError, ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.lines import triangulate
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
+from kinefit.rigs.refine import result
 from kinefit.rigs.refine.gauge import aligned, resized
-from kinefit.rigs.refine.result import MAX_STATIC_SIGMA_PX, CameraChange, Refinement, bias, chance, changes_of
-from kinefit.rigs.refine.sightings import (
-    PersonSighting,
-    PersonTrial,
-    Progress,
-    body_model,
-    pixel_frames,
-    sight,
-    spread_frames,
-    static_pixels,
-)
 from kinefit.solving.bundle.adjust import BundleState, adjust
-from kinefit.solving.bundle.body_bundle import BodyProblem
 from kinefit.solving.bundle.cameras import COLUMNS, FOCAL, POSE, RADIAL, TIME, CameraPrior, PointPixels, departure
+from kinefit.solving.bundle.shape import BodyProblem
 
 PLACE_SIGMA = 0.05
 """[m] of a camera's calibrated centre: a tripod that was knocked, not a camera that was moved."""
@@ -55,7 +45,7 @@ _MAX_RESIDUAL = 0.02  # of the image's diagonal: a camera with more is another o
 
 StaticPoints = Mapping[str, Mapping[str, tuple[float, float]]]
 Length = tuple[str, str, float]
-Gauge = Callable[[Rig, PersonSighting], tuple[Rig, str]]
+Gauge = Callable[[Rig, result.PersonSighting], tuple[Rig, str]]
 
 
 @renamed(accuracy="sigma")
@@ -73,8 +63,8 @@ def refine(
     known_length: Length | None = None,
     up: str = "z",
     sigma: float = KEYPOINT_SIGMA,
-    progress: Progress | None = None,
-) -> Refinement:
+    progress: result.Progress | None = None,
+) -> result.Refinement:
     """Refine a rig by the person in view, and by static points if given.
 
     A robust bundle adjustment estimates poses, bone lengths, landmark offsets and cameras jointly. Then the person is
@@ -102,10 +92,10 @@ def refine(
     check_input(rig, keypoints, height, known_length, static_points)
     prior_std = prior_sigma(len(rig), focal=focal, distortion=distortion, time_offsets=time_offsets)
 
-    def gauge(new: Rig, seen: PersonSighting) -> tuple[Rig, str]:
+    def gauge(new: Rig, seen: result.PersonSighting) -> tuple[Rig, str]:
         return _in_old_frame(new, rig, seen, static_points or {}, height, known_length)
 
-    trial, prior = PersonTrial(keypoints, body, up, sigma), CameraPrior(rig, prior_std)
+    trial, prior = result.PersonTrial(keypoints, body, up, sigma), CameraPrior(rig, prior_std)
     return refine_from(rig, trial, prior, gauge, static_points=static_points, progress=progress)
 
 
@@ -120,22 +110,22 @@ def prior_sigma(cameras: int, *, focal: bool, distortion: bool, time_offsets: bo
 
 
 def refine_from(
-    rig: Rig, trial: PersonTrial, prior: CameraPrior, gauge: Gauge, *, static_points: StaticPoints | None = None,
-    free: PointPixels | None = None, progress: Progress | None = None, from_scratch: bool = False,
-) -> Refinement:  # fmt: skip
+    rig: Rig, trial: result.PersonTrial, prior: CameraPrior, gauge: Gauge, *, static_points: StaticPoints | None = None,
+    free: PointPixels | None = None, progress: result.Progress | None = None, from_scratch: bool = False,
+) -> result.Refinement:  # fmt: skip
     """Refine as `refine`, from any start with any prior.
 
     `gauge` transforms the rig to its final frame, and returns the rule as text; `free` are pixels of further points
     without a prior.
     """
     step = progress or (lambda *_: None)
-    names, static = static_pixels(rig, static_points or {}, _STATIC_SIGMA_PX)
+    names, static = result.static_pixels(rig, static_points or {}, _STATIC_SIGMA_PX)
     if free is not None and len(free.point):
         both = ((static.camera, free.camera), (static.point, len(names) + free.point), (static.uv, free.uv),
                 (static.weight, free.weight))  # fmt: skip
         static = PointPixels(*map(np.concatenate, both))
     offsets = np.zeros(len(rig))
-    first: PersonSighting | None = None
+    first: result.PersonSighting | None = None
     rounds = _MAX_CLOCK_ROUNDS if prior.free[:, TIME].any() else _MAX_ROUNDS
     for turn in range(rounds):
         step("refining", turn, rounds + 1)
@@ -144,9 +134,9 @@ def refine_from(
         residual_sigma = float(np.nanmedian(np.linalg.norm(seen.residuals, axis=-1))) / _RAYLEIGH_MEDIAN
         if residual_sigma > 2.0 * trial.sigma:  # else the loss rejects most points
             seen = _sight(rig, replace(trial, sigma=min(residual_sigma, _MAX_SIGMA_PX)), offsets)
-        chosen = spread_frames(seen, _MAX_FRAMES)
+        chosen = result.spread_frames(seen, _MAX_FRAMES)
         _check_frames(seen, chosen)
-        pixels, (model, theta) = pixel_frames(seen, chosen), body_model(seen, trial.body)
+        pixels, (model, theta) = result.pixel_frames(seen, chosen), result.body_model(seen, trial.body)
         states = [seen.motion.state(int(f)) for f in chosen]
         start = BundleState(rig, np.zeros(len(rig)), static_start(rig, static), theta, states)
         problem = BodyProblem(static, model=model, frames=pixels)
@@ -159,24 +149,24 @@ def refine_from(
     else:  # the last adjustment may have changed the scale, which the gauge takes from the person
         seen = _sight(rig, trial, offsets)
     step("refining", rounds, rounds + 1)
-    covariance = chance(bundle, seen, chosen) + bias(problem, bundle)
+    covariance = result.chance(bundle, seen, chosen) + result.bias(problem, bundle)
     rig, rule = gauge(rig, seen)
     last = _sight(rig, trial, offsets)
     assert first is not None
-    changes, distance = changes_of(prior.rig, rig, first, last, covariance, offsets)
+    changes, distance = result.changes_of(prior.rig, rig, first, last, covariance, offsets)
     step("refining", rounds + 1, rounds + 1)
     check_result(rig, changes, distance, times=_FROM_SCRATCH_FACTOR if from_scratch else 1.0)
     static_residuals = _static_residuals(rig, static, names)
-    return Refinement(
+    return result.Refinement(
         rig, dict(zip(rig.names, offsets.tolist(), strict=True)), changes, rule, chosen,
-        all(c.uncertainty <= MAX_STATIC_SIGMA_PX for c in changes.values()), last.motion, distance,
+        all(c.uncertainty <= result.MAX_STATIC_SIGMA_PX for c in changes.values()), last.motion, distance,
         static_residuals, from_scratch,
     )  # fmt: skip
 
 
-def _sight(rig: Rig, trial: PersonTrial, offsets: NDArray) -> PersonSighting:
+def _sight(rig: Rig, trial: result.PersonTrial, offsets: NDArray) -> result.PersonSighting:
     try:
-        return sight(rig, trial, dict(zip(rig.names, offsets.tolist(), strict=True)))
+        return result.sight(rig, trial, dict(zip(rig.names, offsets.tolist(), strict=True)))
     except TrackingError as error:
         raise CalibrationError(
             f"the cameras agree on no person ({error.problem})",
@@ -203,13 +193,14 @@ def _static_residuals(rig: Rig, static: PointPixels, names: tuple[str, ...]) -> 
 
 
 def _in_old_frame(
-    rig: Rig, old: Rig, seen: PersonSighting, static: StaticPoints, height: float | None, known_length: Length | None
+    rig: Rig, old: Rig, seen: result.PersonSighting, static: StaticPoints, height: float | None,
+    known_length: Length | None,
 ) -> tuple[Rig, str]:
     """The rig in the old frame with the known scale, and the rule as text."""
     rule = "The world is the old calibration's: all cameras together stay as near as possible to their old poses"
     if known_length is not None:
         a, b, metres = known_length
-        names, pixels = static_pixels(rig, static, _STATIC_SIGMA_PX)
+        names, pixels = result.static_pixels(rig, static, _STATIC_SIGMA_PX)
         if a in names and b in names:
             x = static_start(rig, pixels)
             length = float(np.linalg.norm(x[names.index(a)] - x[names.index(b)]))
@@ -224,7 +215,7 @@ def _in_old_frame(
     return aligned(resized(rig, metres / length), old, scale=False)[0], f"{rule} in position and rotation{text}."
 
 
-def length_of(seen: PersonSighting, a: str, b: str) -> float:
+def length_of(seen: result.PersonSighting, a: str, b: str) -> float:
     """Median distance [m] between two keypoints of the tracked person."""
     x = seen.motion.positions(seen.channels.with_points(seen.motion.body).points.select((a, b)))
     return float(np.median(np.linalg.norm(x[:, 0] - x[:, 1], axis=1)))
@@ -265,7 +256,7 @@ def check_input(
             rig.index(camera)
 
 
-def _check_frames(seen: PersonSighting, frames: NDArray) -> None:
+def _check_frames(seen: result.PersonSighting, frames: NDArray) -> None:
     if len(frames) < _MIN_FRAMES:
         raise CalibrationError(
             f"only {len(frames)} of {len(seen.motion)} frames show the person well enough to refine the cameras",
@@ -273,7 +264,7 @@ def _check_frames(seen: PersonSighting, frames: NDArray) -> None:
         )
 
 
-def check_result(rig: Rig, changes: Mapping[str, CameraChange], distance: float, *, times: float = 1.0) -> None:
+def check_result(rig: Rig, changes: Mapping[str, result.CameraChange], distance: float, *, times: float = 1.0) -> None:
     """Check that refined cameras fit the keypoints, and that the recording determines them.
 
     Parameters

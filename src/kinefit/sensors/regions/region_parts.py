@@ -22,7 +22,7 @@ from kinefit.images import _kernels_regions as kernels
 from kinefit.images.regions import Ratios
 from kinefit.sensors.regions import _kernels_region_seams as seam_kernels
 from kinefit.sensors.scene import Scene
-from kinefit.solving.correspondences.contours.rims import Rim, RimFinder, Window
+from kinefit.solving.correspondences.contours.outlines import Rim, RimFinder, Window
 from kinefit.solving.rows import DofRows
 
 _MAX_LEVEL = 127  # of a stored log ratio, to either side of 0

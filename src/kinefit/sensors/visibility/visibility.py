@@ -28,8 +28,8 @@ from kinefit.errors import BodyError
 from kinefit.geometry.camera import Camera
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, BELIEVED, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.visibility import _kernels_visibility as kernels
-from kinefit.solving.correspondences.contours.rims import RimFinder
-from kinefit.solving.correspondences.occupancy.depth_image import SurfaceSamples
+from kinefit.solving.correspondences.contours.outlines import RimFinder
+from kinefit.solving.correspondences.occupancy.free_space import SurfaceSamples
 from kinefit.solving.correspondences.targets import check_depth_image
 
 RENDER_COLUMNS = 160  # of the rendered image: a person's forearm at 3 m is then four pixels wide

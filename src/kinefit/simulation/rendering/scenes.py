@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.bodies.motion import UP_AXES, Motion
 from kinefit.bodies.rendering import Canvas, Raster, scaled, subdivided
+from kinefit.bodies.surfaces.mesh import BodyMesh
 from kinefit.bodies.surfaces.places import body_mesh
-from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.simulation.figures import places, shifted_camera

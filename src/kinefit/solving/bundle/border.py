@@ -17,16 +17,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.solving import _kernels_linear
+from kinefit.solving.bundle import border_frames
 from kinefit.solving.bundle.arrow import Arrow, Blocks
-from kinefit.solving.bundle.border_frames import (
-    MAX_POSE_STEPS,
-    BorderedProblem,
-    FrameEquations,
-    Weighing,
-    differences,
-    gram,
-    settle,
-)
 from kinefit.solving.equations import lock
 from kinefit.solving.least_squares import MAX_DAMPING, bounds_of, descend
 
@@ -80,14 +72,14 @@ class Bordered:
 
 
 def solve(
-    problem: BorderedProblem,
+    problem: border_frames.BorderedProblem,
     theta: NDArray,
     states: Sequence[BodyState],
     prior: Prior,
     steps: NDArray,
     *,
-    weighing: Weighing | None = None,
-    iterations: tuple[int, int] = (20, MAX_POSE_STEPS),
+    weighing: border_frames.Weighing | None = None,
+    iterations: tuple[int, int] = (20, border_frames.MAX_POSE_STEPS),
     tolerance: float = 1e-4,
 ) -> Bordered:
     """Minimise Σ share·ρ(w r²) over K poses and the parameters that they share, prior and postures included.
@@ -108,7 +100,7 @@ def solve(
     ObservationError
         A sensor's rows differ in number between two worlds; rows on segments that the body lacks.
     """
-    task = _Task(problem, prior, np.asarray(steps, float), weighing or Weighing(), iterations[1])
+    task = _Task(problem, prior, np.asarray(steps, float), weighing or border_frames.Weighing(), iterations[1])
     bounds = bounds_of(problem.body(np.asarray(theta, float)), True)
     start = task.at(np.array(theta, float), [s.retract(np.zeros(6 + len(s.angles)), bounds) for s in states])
     mean = float(np.mean([np.trace(f.H) / len(f.H) for f in start.frames])) if start.frames else 1.0
@@ -124,15 +116,15 @@ def solve(
 class _Task:
     """A problem with its prior, difference steps, weights, and number of steps of the poses alone."""
 
-    problem: BorderedProblem
+    problem: border_frames.BorderedProblem
     prior: Prior
     steps: NDArray
-    weighing: Weighing
+    weighing: border_frames.Weighing
     settling: int
 
     def at(self, theta: NDArray, states: Sequence[BodyState]) -> _Point:
         """The point with parameters (p,) and near states, each pose fitted alone."""
-        frames, states = settle(self.problem, theta, states, self.weighing, self.settling)
+        frames, states = border_frames.settle(self.problem, theta, states, self.weighing, self.settling)
         away = theta - self.prior.mean
         cost = float(away @ self.prior.information @ away) + sum(f.cost for f in frames)
         return _Point(self, theta, states, frames, cost)
@@ -148,7 +140,7 @@ class _Point:
     task: _Task
     theta: NDArray
     states: Sequence[BodyState]
-    frames: Sequence[FrameEquations]
+    frames: Sequence[border_frames.FrameEquations]
     cost: float
     known: tuple[list[NDArray], list[NDArray]] | None = None
     change: float = 0.0
@@ -163,7 +155,7 @@ class _Point:
         """(N, p) of every frame: whitened derivatives, without robust factors; known ones if the used rows are same."""
         if self.known is not None and all(map(np.array_equal, self.known[0], self.used)):
             return self.known[1]
-        return differences(self.task.problem, self.theta, self.task.steps, self.states)
+        return border_frames.differences(self.task.problem, self.theta, self.task.steps, self.states)
 
     @cached_property
     def _open(self) -> Arrow:
@@ -172,9 +164,9 @@ class _Point:
         S, b, H, g, B = np.zeros((p, p)), np.zeros(p), np.empty((F, n, n)), np.empty((F, n)), np.empty((F, n, p))
         for f, (frame, D, used) in enumerate(zip(self.frames, self.by_theta, self.used, strict=True)):
             T = (frame.factor * used)[:, None] * D
-            S += gram(T, T)
+            S += border_frames.gram(T, T)
             b += frame.residual @ T
-            H[f], g[f], B[f] = frame.H, frame.g, gram(frame.J, T)
+            H[f], g[f], B[f] = frame.H, frame.g, border_frames.gram(frame.J, T)
         return Arrow(S, b, (Blocks(H, g, B),))
 
     @cached_property

@@ -1,13 +1,9 @@
 """Row makers: observations and a body at a state to linearised measurements, one file for each kind."""
 
-from kinefit.solving.correspondences.anchored import anchored_rows, target_rows
-from kinefit.solving.correspondences.bands import Bands, band_rows, coincidence_rows, joint_bands
-from kinefit.solving.correspondences.closures import closure_rows
+from kinefit.solving.correspondences.closures import Bands, band_rows, closure_rows, coincidence_rows, joint_bands
 from kinefit.solving.correspondences.contours.morphed import morphed_outline_rows, morphed_rows
 from kinefit.solving.correspondences.contours.outlines import outline_pairs, outline_rows
-from kinefit.solving.correspondences.occupancy.collisions import collision_rows
-from kinefit.solving.correspondences.occupancy.depth_image import depth_image_rows
-from kinefit.solving.correspondences.occupancy.free_space import free_space_rows
+from kinefit.solving.correspondences.occupancy.free_space import collision_rows, depth_image_rows, free_space_rows
 from kinefit.solving.correspondences.points import (
     edge_rows,
     image_line_rows,
@@ -19,7 +15,7 @@ from kinefit.solving.correspondences.points import (
     prior_rows,
     ray_rows,
 )
-from kinefit.solving.correspondences.surfaces import field_rows, surface_rows
+from kinefit.solving.correspondences.surfaces import anchored_rows, field_rows, surface_rows, target_rows
 
 __all__ = [
     "Bands", "anchored_rows", "band_rows", "closure_rows", "coincidence_rows", "collision_rows", "depth_image_rows",

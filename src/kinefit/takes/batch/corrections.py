@@ -96,7 +96,7 @@ def add_click(take: TakePath, step: int, camera: str, landmark: str, uv: Sequenc
     ----------
     step : int, of the take's common time
     camera : str, name in the take
-    landmark : str, of the take's body, see `kinefit.fitting.initialization.from_clicks.clickable`
+    landmark : str, of the take's body, see `kinefit.fitting.initialization.from_points.clickable`
     uv : (2,) [px] in the camera's own image
 
     Raises

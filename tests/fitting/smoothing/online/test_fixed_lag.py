@@ -22,16 +22,14 @@ from tests.fitting.tracking.movements import (
 from kinefit import BodyState, Recording, load_body, track
 from kinefit.bodies.tree import twin
 from kinefit.errors import ObservationError
-from kinefit.fitting.smoothing.online.fixed_lag import FixedLag
-from kinefit.fitting.smoothing.online.lag_frame import KnownNoise
+from kinefit.fitting.smoothing.online.fixed_lag import FixedLag, KnownNoise
 from kinefit.fitting.smoothing.smoother import as_tracked
 from kinefit.fitting.smoothing.tracked_frames import TrackedFrames
 from kinefit.fitting.smoothing.unwrap import continued, unwrap
 from kinefit.fitting.subject.subject import Subject
 from kinefit.solving.equations import block_diagonal
-from kinefit.solving.trajectory.marginal import leave
 from kinefit.solving.trajectory.motion_prior import MotionPrior
-from kinefit.solving.trajectory.smoothing import smooth
+from kinefit.solving.trajectory.smoothing import leave, smooth
 
 COLOUR = "left", "right"
 SIGMA = dict.fromkeys(COLOUR, 2.0)

@@ -6,7 +6,7 @@ from tests.images.photogrammetry import scenes
 
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.images.photogrammetry.region_growing import Grid
+from kinefit.images.photogrammetry.least_squares_matching import Grid
 from kinefit.images.photogrammetry.seeding.unaided import grow_between, grow_over_time, ray_seeds
 from kinefit.images.photogrammetry.spline_image import SplineImage
 

@@ -9,8 +9,7 @@ from kinefit.bodies import load_body
 from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
-from kinefit.solving.correspondences.contours.outlines import outline_pairs, outline_rows
-from kinefit.solving.correspondences.contours.rims import RimFinder
+from kinefit.solving.correspondences.contours.outlines import RimFinder, outline_pairs, outline_rows
 
 
 @dataclass

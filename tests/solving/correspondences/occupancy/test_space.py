@@ -16,9 +16,7 @@ from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.solving.correspondences import collision_rows, free_space_rows
 from kinefit.solving.correspondences.occupancy._kernels_space import capsule_gaps
-from kinefit.solving.correspondences.occupancy.collisions import _capsules, collision_pairs
-from kinefit.solving.correspondences.occupancy.depth_image import SurfaceSamples
-from kinefit.solving.correspondences.occupancy.free_space import FreeSpace
+from kinefit.solving.correspondences.occupancy.free_space import FreeSpace, SurfaceSamples, _capsules, collision_pairs
 from kinefit.solving.least_squares import gauss_newton
 
 CAMERA = Camera("depth", (320, 240), [[250.0, 0, 159.5], [0, 250.0, 119.5], [0, 0, 1]])

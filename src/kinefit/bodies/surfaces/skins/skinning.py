@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._files import metres_of, read_text
-from kinefit.bodies.surfaces.mesh import MAX_LENGTH, check_triangles, read_obj
+from kinefit.bodies.surfaces.mesh import MAX_LENGTH, BodyMesh, check_triangles, read_obj
 from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
-from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError, check_choice, located
 

@@ -13,31 +13,7 @@ import numpy as np
 
 from kinefit._jit import jit
 from kinefit.geometry._kernels_camera import project_jacobian
-from kinefit.images.photogrammetry.matching._kernels_matching import (
-    CORRELATION,
-    COV,
-    DIVERGED,
-    FLAT,
-    FOUND,
-    GAIN,
-    OUTSIDE_IMAGE,
-    ROW,
-    SIZE,
-    STATUS,
-    VAR_U,
-    VAR_V,
-    A,
-    U,
-    V,
-    composed,
-    covariance,
-    factor,
-    fits,
-    normal_matrix,
-    right_side,
-    room,
-    template,
-)
+from kinefit.images.photogrammetry.matching import _kernels_matching as lsm
 
 # Row of results: distance [m], its variance, correlation, parallax [px], images, iterations, status.
 DISTANCE, VARIANCE, SIMILARITY, PARALLAX, IMAGES, STEPS, STATE = 0, 1, 2, 3, 4, 5, 6
@@ -50,7 +26,7 @@ def conditional(m, y, b, gain, du, dv):
     b[6], b[7] = gain * du, gain * dv
     for i in range(5, -1, -1):
         s = y[i]
-        for k in range(i + 1, SIZE):
+        for k in range(i + 1, lsm.SIZE):
             s -= m[k, i] * b[k]
         b[i] = s / m[i, i]
 
@@ -66,8 +42,8 @@ def match_rays(
     Fills out (N, 7) and, for each image, each (N, K, 15).
     """
     count = images.shape[0]
-    f, fx, fy, rows, m, b, _ = room(halves)
-    y, moves, squares = np.empty((count, SIZE)), np.empty((count, 6)), np.empty(count)
+    f, fx, fy, rows, m, b, _ = lsm.room(halves)
+    y, moves, squares = np.empty((count, lsm.SIZE)), np.empty((count, 6)), np.empty(count)
     used = np.empty(count, np.bool_)
     for k in range(at.shape[0]):
         _match_ray(
@@ -85,24 +61,24 @@ def _match_ray(
     for c in range(COLUMNS):
         out[c] = math.nan
     for i in range(count):
-        for c in range(ROW):
+        for c in range(lsm.ROW):
             each[i, c] = math.nan
-    mean = template(first, at[0], at[1], half, f, fx, fy, rows)
+    mean = lsm.template(first, at[0], at[1], half, f, fx, fy, rows)
     if not (abs(mean) < math.inf and abs(start[0]) < math.inf):
-        out[STATE] = OUTSIDE_IMAGE
+        out[STATE] = lsm.OUTSIDE_IMAGE
         return
-    normal_matrix(f, fx, fy, half, mean, m)
+    lsm.normal_matrix(f, fx, fy, half, mean, m)
     f_f = m[5, 5]
-    if not factor(m, SIZE):
-        out[STATE] = FLAT
+    if not lsm.factor(m, lsm.SIZE):
+        out[STATE] = lsm.FLAT
         return
     s00, s01, s11 = m[6, 6] ** 2, m[7, 6] * m[6, 6], m[7, 6] ** 2 + m[7, 7] ** 2
-    distance, status, taken = start[0], DIVERGED, 0
+    distance, status, taken = start[0], lsm.DIVERGED, 0
     for i in range(count):
         used[i] = True
-        each[i, GAIN] = 1.0
+        each[i, lsm.GAIN] = 1.0
         for c in range(4):
-            each[i, A + c] = start[1 + 4 * i + c]
+            each[i, lsm.A + c] = start[1 + 4 * i + c]
             used[i] = used[i] and abs(start[1 + 4 * i + c]) < math.inf
         squares[i] = 1.0
     parallax = correlation = 0.0
@@ -114,16 +90,16 @@ def _match_ray(
             if not used[i]:
                 continue
             ok, u, v, ux, uy, uz, vx, vy, vz = project_jacobian(cameras[i], x, yy, z)
-            a11, a12, a21, a22 = each[i, A], each[i, A + 1], each[i, A + 2], each[i, A + 3]
+            a11, a12, a21, a22 = each[i, lsm.A], each[i, lsm.A + 1], each[i, lsm.A + 2], each[i, lsm.A + 3]
             c = images[i, : sizes[i, 0], : sizes[i, 1]]
-            if not ok or not fits(c, u, v, a11, a12, a21, a22, half):
+            if not ok or not lsm.fits(c, u, v, a11, a12, a21, a22, half):
                 used[i] = False
                 continue
-            _, hh = right_side(c, f, fx, fy, half, mean, u, v, a11, a12, a21, a22, b)
+            _, hh = lsm.right_side(c, f, fx, fy, half, mean, u, v, a11, a12, a21, a22, b)
             variance = hh - b[4] * b[4] / n
-            each[i, CORRELATION] = b[5] / math.sqrt(f_f * variance) if variance > 0.0 else 0.0
+            each[i, lsm.CORRELATION] = b[5] / math.sqrt(f_f * variance) if variance > 0.0 else 0.0
             squares[i] = hh
-            for r in range(SIZE):  # forward substitution
+            for r in range(lsm.SIZE):  # forward substitution
                 s = b[r]
                 for q in range(r):
                     s -= m[r, q] * y[i, q]
@@ -137,19 +113,19 @@ def _match_ray(
             if not gain > 0.05:
                 used[i] = False
                 continue
-            each[i, GAIN], each[i, U], each[i, V] = gain, u, v
+            each[i, lsm.GAIN], each[i, lsm.U], each[i, lsm.V] = gain, u, v
             pu, pv = ux * ray[0] + uy * ray[1] + uz * ray[2], vx * ray[0] + vy * ray[1] + vz * ray[2]
             det = a11 * a22 - a12 * a21
             qu, qv = (a22 * pu - a12 * pv) / det, (a11 * pv - a21 * pu) / det
             du, dv = free_u / gain, free_v / gain
-            weight = gain * gain * (n - SIZE) / (squares[i] if squares[i] > 1e-9 * hh else 1e-9 * hh + 1e-30)
+            weight = gain * gain * (n - lsm.SIZE) / (squares[i] if squares[i] > 1e-9 * hh else 1e-9 * hh + 1e-30)
             above -= weight * (qu * (s00 * du + s01 * dv) + qv * (s01 * du + s11 * dv))
             below += weight * (s00 * qu * qu + 2.0 * s01 * qu * qv + s11 * qv * qv)
             moves[i, 0], moves[i, 1], moves[i, 2], moves[i, 3], moves[i, 4], moves[i, 5] = qu, qv, du, dv, pu, pv
-            correlation += each[i, CORRELATION]
+            correlation += each[i, lsm.CORRELATION]
             taken += 1
         if taken == 0 or not below > 0.0:
-            status = OUTSIDE_IMAGE
+            status = lsm.OUTSIDE_IMAGE
             break
         change = above / below
         distance += change
@@ -157,44 +133,44 @@ def _match_ray(
         for i in range(count):
             if not used[i]:
                 continue
-            gain = each[i, GAIN]
+            gain = each[i, lsm.GAIN]
             du, dv = -moves[i, 0] * change, -moves[i, 1] * change
             off_u, off_v = moves[i, 2] - du, moves[i, 3] - dv
             squares[i] += gain * gain * (s00 * off_u * off_u + 2.0 * s01 * off_u * off_v + s11 * off_v * off_v)
             conditional(m, y[i], b, gain, du, dv)
-            a11, a12, a21, a22 = each[i, A], each[i, A + 1], each[i, A + 2], each[i, A + 3]
+            a11, a12, a21, a22 = each[i, lsm.A], each[i, lsm.A + 1], each[i, lsm.A + 2], each[i, lsm.A + 3]
             ou, ov = a11 * off_u + a12 * off_v, a21 * off_u + a22 * off_v
             parallax += ou * ou + ov * ov
-            ok, n11, n12, n21, n22 = composed(a11, a12, a21, a22, b, 1.0 / (gain * half))
+            ok, n11, n12, n21, n22 = lsm.composed(a11, a12, a21, a22, b, 1.0 / (gain * half))
             if not ok:
                 used[i] = False
                 continue
-            each[i, A], each[i, A + 1], each[i, A + 2], each[i, A + 3] = n11, n12, n21, n22
+            each[i, lsm.A], each[i, lsm.A + 1], each[i, lsm.A + 2], each[i, lsm.A + 3] = n11, n12, n21, n22
             turned = half * (abs(n11 - a11) + abs(n12 - a12) + abs(n21 - a21) + abs(n22 - a22))
             step2 = change * change * (moves[i, 4] ** 2 + moves[i, 5] ** 2) + turned * turned
             moved = step2 if step2 > moved else moved
         parallax = math.sqrt(parallax / taken)
         out[STEPS] = step + 1.0
         if moved <= tolerance * tolerance:
-            status = FOUND
+            status = lsm.FOUND
             break
     out[DISTANCE], out[STATE], out[PARALLAX], out[IMAGES] = distance, status, parallax, taken
     out[SIMILARITY] = correlation / taken if taken else math.nan
-    if status != FOUND:
+    if status != lsm.FOUND:
         return
     total = 0.0
     for i in range(count):
-        each[i, STATUS] = FOUND if used[i] else OUTSIDE_IMAGE
+        each[i, lsm.STATUS] = lsm.FOUND if used[i] else lsm.OUTSIDE_IMAGE
         if used[i]:
-            covariance(m, at[0], at[1], half, each[i, GAIN], squares[i], share, own, each[i])
-            if each[i, STATUS] == FOUND:
+            lsm.covariance(m, at[0], at[1], half, each[i, lsm.GAIN], squares[i], share, own, each[i])
+            if each[i, lsm.STATUS] == lsm.FOUND:
                 total += _information(each[i], moves[i, 4], moves[i, 5])
     if not total > 0.0:
-        out[STATE] = FLAT
+        out[STATE] = lsm.FLAT
         return
     variance = mu = mv = 0.0  # the template's noise shifts all images' windows equally, so it may cancel
     for i in range(count):
-        if used[i] and each[i, STATUS] == FOUND:
+        if used[i] and each[i, lsm.STATUS] == lsm.FOUND:
             information, qu, qv = _information(each[i], moves[i, 4], moves[i, 5]), moves[i, 0], moves[i, 1]
             variance += (1.0 - share) * information / (total * total)
             root = math.sqrt(information / (s00 * qu * qu + 2.0 * s01 * qu * qv + s11 * qv * qv))  # 1 / sigma
@@ -205,5 +181,5 @@ def _match_ray(
 @jit
 def _information(row, pu, pv):
     """Information of an image about the distance: p' C^-1 p for its shift p per distance and covariance C."""
-    a, b, d = row[VAR_U], row[COV], row[VAR_V]
+    a, b, d = row[lsm.VAR_U], row[lsm.COV], row[lsm.VAR_V]
     return (pu * pu * d - 2.0 * pu * pv * b + pv * pv * a) / (a * d - b * b)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.images.photogrammetry.matching import _kernels_spline as spline
+from kinefit.images.photogrammetry.matching import _kernels_matching as spline
 from kinefit.images.photogrammetry.spline_image import SplineImage
 
 _MAX_LAG_PX = 3  # covers most of a colour filter's interpolation and JPEG's ringing

@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.lines import triangulate_robust
-from kinefit.images.photogrammetry.least_squares_matching import Matches, as_points
+from kinefit.images.photogrammetry.least_squares_matching import Grid, Matches, Seeds, as_points, grow
 from kinefit.images.photogrammetry.matching.multi_image import search_box
-from kinefit.images.photogrammetry.region_growing import Grid, Seeds, grow
 from kinefit.images.photogrammetry.seeding import _kernels_rays as kernels
 from kinefit.images.photogrammetry.spline_image import SplineImage
 

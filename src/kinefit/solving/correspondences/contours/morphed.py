@@ -11,7 +11,7 @@ from kinefit._arguments import shaped
 from kinefit.bodies.morphs.morphing import MorphedPose
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
-from kinefit.solving.correspondences.contours.rims import Rim
+from kinefit.solving.correspondences.contours.outlines import Rim
 from kinefit.solving.rows import DofRows, Rows
 
 

@@ -1,18 +1,230 @@
-"""Contour to contour: rim points of the body towards the contour of its silhouette (P1 2.3)."""
+"""Contour to contour: rim points of the body towards the contour of its silhouette (P1 2.3).
+
+Occluding contour of a body in a camera: rim points of its mesh, tested in a rendered image (P1 2.3).
+
+A rim point lies on an edge between a triangle that faces the camera and one that does not. A rendered image with depth
+and triangle of every pixel shows whether the point is visible, and whether another part of the body is behind it.
+"""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.rendering import Canvas, Raster, lens_of
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.geometry.lines import line_along
 from kinefit.solving.correspondences import _kernels
 from kinefit.solving.correspondences.contours import _kernels_outlines as kernels
-from kinefit.solving.correspondences.contours.rims import Rim
 from kinefit.solving.rows import Rows
+
+_MAX_RIM_POINTS = 20000  # of one image
+_MAX_DEPTH_STEP = 0.05  # [m] from a rim to the limb's surface one pixel inside of it, which may be nearer
+_MIN_OCCLUSION_DEPTH = 0.03  # [m] behind the rim of a part that occludes another; less is a crease
+_OTHER_BODY = -2  # in an image of triangles
+_MARGIN_PX = 4.0  # of a window around the body
+_WINDOW_STEP_PX = 32  # of window sizes, so that few canvases serve all windows
+
+
+class Window(NamedTuple):
+    """A part of a camera's image, rendered at another scale: its pixel i is at (i + 0.5) / scale - 0.5 + left.
+
+    Parameters
+    ----------
+    left, top : float [px] of the camera's image
+    size : (width, height) [px] of the window
+    scale : float, window pixels for one pixel of the camera
+    """
+
+    left: float
+    top: float
+    size: tuple[int, int]
+    scale: float
+
+    @classmethod
+    def about(cls, uv: NDArray, camera: Camera, longest: int) -> Window:
+        """Window around points (N, 2) [px] of a camera's image, at most `longest` [px] wide plus a margin."""
+        (left, top, right, bottom), (width, height) = kernels.bounds(uv), camera.size
+        left, right = min(max(left, 0.0), width - 1.0), min(max(right, 0.0), width - 1.0)
+        top, bottom = min(max(top, 0.0), height - 1.0), min(max(bottom, 0.0), height - 1.0)
+        scale = min(longest / max(right - left, bottom - top, 1.0), 1.0)
+        margin = math.ceil(_MARGIN_PX / scale)
+        wide, high = ((n + 2 * margin + 1) * scale for n in (right - left, bottom - top))
+        size = math.ceil(wide / _WINDOW_STEP_PX) * _WINDOW_STEP_PX, math.ceil(high / _WINDOW_STEP_PX) * _WINDOW_STEP_PX
+        return cls(float(math.floor(left - margin)), float(math.floor(top - margin)), size, scale)
+
+    def lens(self, camera: Camera) -> NDArray:
+        """Focal lengths and principal point (4,) [px] of the window."""
+        fx, fy, cx, cy = lens_of(camera)
+        offset = cx - self.left + 0.5, cy - self.top + 0.5
+        return np.array([fx, fy, *offset]) * self.scale - (0.0, 0.0, 0.5, 0.5)
+
+
+class Triangles(Protocol):
+    """A mesh whose faces have segments."""
+
+    @property
+    def faces(self) -> NDArray:
+        """Faces (T, 3) int."""
+        ...
+
+    @property
+    def face_segment(self) -> NDArray:
+        """Segment of each face (T,) int."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Rim:
+    """Occluding contour of a body in one camera, N points.
+
+    Parameters
+    ----------
+    outline : (4, N) u, v [px] and the unit normal (a, b), pointing away from the body.
+    vertices : (N, 2) int, ends of the mesh's edge that each point lies on.
+    share : (N,) 0..1, weight of the second end.
+    segment : (N,) int
+    inner : (N,) bool, whether another part of the body is behind it, so that a silhouette does not show it.
+    """
+
+    outline: NDArray
+    vertices: NDArray
+    share: NDArray
+    segment: NDArray
+    inner: NDArray
+
+    def __len__(self) -> int:
+        return len(self.share)
+
+    def on(self, vertices: NDArray) -> NDArray:
+        """Rim points (N, 3) [m] on vertices (V, 3) [m] of the mesh, in the frame of these: the world, or at rest."""
+        s = self.share[:, None]
+        return np.asarray((1.0 - s) * vertices[self.vertices[:, 0]] + s * vertices[self.vertices[:, 1]])
+
+    def chosen(self, which: NDArray) -> Rim:
+        """The points selected by a mask or indices (k,)."""
+        return Rim(
+            np.ascontiguousarray(self.outline[:, which]), self.vertices[which], self.share[which], self.segment[which],
+            self.inner[which],
+        )  # fmt: skip
+
+
+class RimFinder:
+    """Finds the rims of one mesh repeatedly, with reused buffers and tables.
+
+    Parameters
+    ----------
+    mesh : its faces (T, 3), outward counter-clockwise, with their segments (T,); vertices are given at every call.
+    like : RimFinder of the same mesh, whose tables are shared; finders in parallel need buffers of their own.
+    """
+
+    def __init__(self, mesh: Triangles, like: RimFinder | None = None) -> None:
+        if like is not None:
+            self.__dict__["_edges"] = like._edges
+        self.faces = np.ascontiguousarray(mesh.faces, np.int32)
+        self.face_segment = np.ascontiguousarray(mesh.face_segment, np.int64)
+        self._front = np.empty(len(self.faces), np.int8)
+        self._out, self._place = np.empty((4, _MAX_RIM_POINTS)), np.empty((_MAX_RIM_POINTS, 2))
+        self._kind = np.empty(_MAX_RIM_POINTS, np.int8)
+        self._canvases: dict[tuple[int, int], Canvas] = {}
+        self._last: tuple[Camera, NDArray, Raster, Window] | None = None
+        #: the part of the image that was rendered last, shifted with the body since then
+        self.window = Window(0.0, 0.0, (0, 0), 1.0)
+
+    @cached_property
+    def _edges(self) -> tuple[NDArray, NDArray]:
+        """Edges (E, 2) and the faces (E, 2) on both sides, -1 for none."""
+        ends = np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=2).reshape(-1, 2)
+        owner = np.repeat(np.arange(len(self.faces)), 3)
+        order = np.lexsort((owner, ends.max(axis=1), ends.min(axis=1)))
+        pairs, owner = np.sort(ends, axis=1)[order], owner[order]
+        first = np.flatnonzero(np.any(np.diff(pairs, axis=0, prepend=-1), axis=1))
+        second = np.append(first[1:], len(pairs)) - 1  # a third face on an edge is ignored
+        other = np.where(second > first, owner[second], -1)
+        return np.ascontiguousarray(pairs[first]), np.stack([owner[first], other], axis=1)
+
+    def drawn(self, camera: Camera) -> NDArray:
+        """Triangle (H, W) int32 of every pixel, -1 for none, as last rendered for a camera of this size."""
+        return self._canvases[camera.size].face
+
+    @property
+    def face(self) -> NDArray:
+        """Triangle (H, W) int32 of every pixel of the last rendered window, -1 for none."""
+        assert self._last is not None
+        return self._last[2].face
+
+    @property
+    def depth(self) -> NDArray:
+        """Depth (H, W) float32 [m] along the optical axis, of the last rendered window, inf for none."""
+        assert self._last is not None
+        return self._last[2].depth
+
+    def find(
+        self, vertices_world: NDArray, camera: Camera, *, spacing: float = 3.0, inner: bool = True, stale: float = 0.0,
+        close: int | None = None, others: Sequence[tuple[NDArray, NDArray]] = (),
+    ) -> Rim:  # fmt: skip
+        """Find rim points about `spacing` [px] apart, of the mesh's vertices (V, 3) [m] in the world.
+
+        Parameters
+        ----------
+        vertices_world : (V, 3) [m]
+        camera : Camera
+        spacing : float [px]
+        inner : bool, whether to include rims in front of other parts of the body, which silhouettes do not show.
+        stale : float [px]
+            The last rendered image of this camera is reused if no vertex has moved farther since; with `close`,
+            relative to their common motion.
+        close : int [px], optional
+            Renders only the part of the image that contains the body, at most this wide; see `window`.
+        others : vertices (W, 3) [m] in the world and faces (U, 3) of other bodies
+            They occlude the body, it has no rim in front of them, and the rendered image has -2 for them.
+        """
+        x, uv = np.empty((len(vertices_world), 3)), np.empty((len(vertices_world), 2))
+        kernels.seen(camera.packed, np.ascontiguousarray(vertices_world), x, uv)
+        last, moved = self._last, np.inf
+        if last is not None and last[0] is camera and stale > 0.0:
+            du, dv, moved = kernels.shift(uv, last[1], close is not None)
+        if last is not None and moved <= stale:
+            drawn, w = last[2], last[3]._replace(left=last[3].left + du, top=last[3].top + dv)
+            self.window = w
+        else:
+            w = Window(0.0, 0.0, camera.size, 1.0) if close is None else Window.about(uv, camera, close)
+            if w.size not in self._canvases:
+                self._canvases[w.size] = Canvas(w.size)
+            canvas = self._canvases[w.size]
+            lens = w.lens(camera)
+            drawn = canvas.draw(x, self.faces, lens, cull=True)
+            for vertices, faces in others:
+                there = np.empty((len(vertices), 3))
+                kernels.seen(camera.packed, np.ascontiguousarray(vertices), there, np.empty((len(vertices), 2)))
+                other = Canvas(w.size).draw(there, np.ascontiguousarray(faces, np.int32), lens, cull=True)
+                drawn.face[(other.face >= 0) & (other.depth < drawn.depth)] = _OTHER_BODY
+            self._last = camera, uv, drawn, w
+            self.window = w
+        if close is not None:
+            uv = (uv + (0.5 - w.left, 0.5 - w.top)) * w.scale - 0.5
+        edges, sides = self._edges
+        n = kernels.rims(
+            x, uv, self.faces, self.face_segment, edges, sides, drawn.depth, drawn.face, spacing, _MAX_DEPTH_STEP,
+            _MIN_OCCLUSION_DEPTH, inner, self._front, self._out, self._place, self._kind,
+        )  # fmt: skip
+        number = self._place[:n, 0].astype(np.int64)
+        own = np.where(self._front[sides[number, 0]] == 1, sides[number, 0], sides[number, 1])
+        outline = self._out[:, :n].copy()
+        if close is not None:
+            outline[:2] = (outline[:2] + 0.5) / w.scale - 0.5 + np.array([[w.left], [w.top]])
+        return Rim(
+            outline, edges[number].astype(np.int64), self._place[:n, 1].copy(), self.face_segment[own],
+            self._kind[:n] == kernels.INNER,
+        )  # fmt: skip
 
 
 def outline_pairs(

@@ -15,7 +15,7 @@ from kinefit.bodies.rendering.looks import to_hex
 from kinefit.errors import KinefitError
 from kinefit.exporters.report.moments import Moment, doubtful_moments
 from kinefit.exporters.tables import spoken
-from kinefit.fitting.initialization.from_clicks import clickable
+from kinefit.fitting.initialization.from_points import clickable
 from kinefit.studio.app.desk import Desk
 from kinefit.studio.app.pages.shell import (
     COLOURS,
