@@ -24,13 +24,7 @@ from kinefit.markers.model.from_frame import model_from_frame
 from kinefit.markers.model.gate import TrainingFinding, training_gate
 from kinefit.markers.model.learn import learn_model
 from kinefit.markers.model.model import MarkerModel, load_model
-from kinefit.markers.take.takes import (
-    TakeIdentification,
-    TakeSettings,
-    identify_people,
-    identify_take,
-    one_after_the_other,
-)
+from kinefit.markers.take import takes
 from kinefit.observations import Markers
 from kinefit.takes.batch.results import FORMATS, check_formats, description, write_results
 
@@ -65,7 +59,7 @@ def learn_files(
     KinefitError
         A file cannot be read, its labels do not fit the marker set, or no frame shows enough.
     """
-    markers = one_after_the_other([read_file(path, unit) for path in paths])
+    markers = takes.one_after_the_other([read_file(path, unit) for path in paths])
     name = name or Path(paths[0]).stem
     if frame is None:
         model = learn_model(markers, name=name, template=marker_set)
@@ -99,7 +93,7 @@ def write_first_set(
     from kinefit._files import write_text
     from kinefit.fitting.markers.first_set import first_set
 
-    markers = one_after_the_other([read_file(path, unit) for path in paths])
+    markers = takes.one_after_the_other([read_file(path, unit) for path in paths])
     found = first_set(markers, body=load_body("humanoid"), name=name or Path(out).stem.upper())
     write_text(Path(out), found.text)
     return found
@@ -110,12 +104,12 @@ def identify_file(
     model: MarkerModel | str | PathLike[str] | Sequence[MarkerModel | str | PathLike[str]],
     out: str | PathLike[str] | None = None,
     *,
-    settings: TakeSettings | None = None,
+    settings: takes.TakeSettings | None = None,
     unit: str | None = None,
     rest: bool = False,
     step: Step | None = None,
-    method: Callable[..., TakeIdentification] = identify_take,
-) -> tuple[Markers, dict[str, TakeIdentification], dict[str, Path]]:
+    method: Callable[..., takes.TakeIdentification] = takes.identify_take,
+) -> tuple[Markers, dict[str, takes.TakeIdentification], dict[str, Path]]:
     """Name the markers of a file and write it with labels, with a table of doubtful frames beside it.
 
     Parameters
@@ -147,7 +141,7 @@ def identify_file(
     given = [model] if isinstance(model, MarkerModel | str | PathLike) else list(model)
     models = [m if isinstance(m, MarkerModel) else load_model(m) for m in given]
     markers = read_file(source, unit)
-    found = identify_people(models, markers, settings=settings, progress=step, method=method)
+    found = takes.identify_people(models, markers, settings=settings, progress=step, method=method)
     labelled = _together(models, found, markers, rest)
     both_c3d = source.suffix.lower() == target.suffix.lower() == ".c3d"
     write_markers(labelled, target, like=source if both_c3d else None)
@@ -157,7 +151,9 @@ def identify_file(
     return labelled, named, {"markers": target, "doubts": doubts}
 
 
-def _together(models: list[MarkerModel], found: list[TakeIdentification], markers: Markers, rest: bool) -> Markers:
+def _together(
+    models: list[MarkerModel], found: list[takes.TakeIdentification], markers: Markers, rest: bool
+) -> Markers:
     """One take of all subjects; with `rest` the points of nobody."""
     parts = [f.markers(markers) for f in found]
     if len(models) > 1:
@@ -185,7 +181,7 @@ def _prefixed(name: str, label: str) -> str:
     return f"{name}:{bare(label)}"
 
 
-def _doubts(found: dict[str, TakeIdentification], markers: Markers, many: bool) -> Iterator[Sequence[object]]:
+def _doubts(found: dict[str, takes.TakeIdentification], markers: Markers, many: bool) -> Iterator[Sequence[object]]:
     """Rows of doubtful frames, worst first; frames as the file counts them."""
     rows = sorted((d.confidence, d.first, name, d) for name, f in found.items() for d in f.doubts)
     yield "first_frame", "last_frame", "first_time", "last_time", "label", "kind", "confidence"

@@ -11,23 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit import observations
 from kinefit._arguments import checked
 from kinefit.bodies.motion import UP_AXES
 from kinefit.errors import FileError, ObservationError, TakeError, command, located
 from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.geometry.force_plates import ForcePlate
-from kinefit.observations import (
-    MEDIAPIPE_33,
-    ClickVideo,
-    CloudVideo,
-    DepthVideo,
-    Keypoints,
-    KeypointVideo,
-    LineVideo,
-    Markers,
-    SensorRecording,
-)
 from kinefit.observations.clocks import frame_times, is_even, on_steps
 from kinefit.readers.calibration.read import found_notes
 from kinefit.readers.landmarks.detections import detections_file, read_detections
@@ -74,7 +64,7 @@ class TakeSensor:
 
     kind: SensorKind
     entry: Any
-    recording: SensorRecording
+    recording: observations.SensorRecording
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,18 +108,18 @@ class Observations:
     rate: float
     frames: tuple[int, int]
     rig: Rig | None
-    keypoints: tuple[Keypoints, ...]
-    markers: tuple[Markers, ...]
+    keypoints: tuple[observations.Keypoints, ...]
+    markers: tuple[observations.Markers, ...]
     videos: dict[str, Path]
     images: dict[str, ImageFrame]
-    depth: tuple[DepthVideo, ...] = ()
-    clouds: tuple[CloudVideo, ...] = ()
-    skin: tuple[KeypointVideo, ...] = ()
-    clicks: tuple[ClickVideo, ...] = ()
+    depth: tuple[observations.DepthVideo, ...] = ()
+    clouds: tuple[observations.CloudVideo, ...] = ()
+    skin: tuple[observations.KeypointVideo, ...] = ()
+    clicks: tuple[observations.ClickVideo, ...] = ()
     sensors: tuple[TakeSensor, ...] = ()
     notes: tuple[str, ...] = ()
     first_time: float = 0.0
-    static_markers: tuple[Markers | None, ...] = ()
+    static_markers: tuple[observations.Markers | None, ...] = ()
     plates: tuple[ForcePlate, ...] = ()
 
     if not TYPE_CHECKING:
@@ -138,7 +128,7 @@ class Observations:
             return self.of_kind(old_attribute(name, "Observations.of_kind"))
 
     @property
-    def recordings(self) -> tuple[SensorRecording, ...]:
+    def recordings(self) -> tuple[observations.SensorRecording, ...]:
         """Every recording with `at_step(step, rate)` and `frame(i)`: all but keypoints and markers."""
         of_kinds = (sensor.recording for sensor in self.sensors)
         return (*self.depth, *self.clouds, *of_kinds, *self.skin, *self.clicks)
@@ -162,7 +152,7 @@ def _load_sensors(cameras: TakeCameras) -> tuple[TakeSensor, ...]:
         for k, entry in enumerate(entries):
             name = sensor_name(kind.label or table, entries, k)
             valid = lambda r, name=name, kind=kind: (
-                isinstance(r, SensorRecording) and (r.sensor == name or kind.sensor is None)
+                isinstance(r, observations.SensorRecording) and (r.sensor == name or kind.sensor is None)
             )
             with located(cameras.take.path, title_of(table, entry)):
                 what = f"a SensorRecording of the sensor '{name}'"
@@ -236,12 +226,12 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         notes.append(f"{len(plates) - len(once)} force plates are named twice and count once")
     plates = once
     deep = read_each(take, take.depth, partial(load_depth, cameras=of_cameras))
-    depth = tuple(video for video in deep if isinstance(video, DepthVideo))
-    clouds = tuple(video for video in deep if isinstance(video, CloudVideo))
+    depth = tuple(video for video in deep if isinstance(video, observations.DepthVideo))
+    clouds = tuple(video for video in deep if isinstance(video, observations.CloudVideo))
     sensors = _load_sensors(of_cameras)
     skin = read_each(take, take.skin, partial(load_skin, cameras=of_cameras))
     fastest, clicks = of_cameras.fastest, load_clicks(of_cameras)
-    recordings: tuple[SensorRecording, ...] = (*depth, *clouds, *(sensor.recording for sensor in sensors))
+    recordings: tuple[observations.SensorRecording, ...] = (*depth, *clouds, *(sensor.recording for sensor in sensors))
     marked = [(f"[[markers]] {k}", e.time_offset + m.times) for k, (e, m) in enumerate(zip(take.markers, markers), 1)]
     if not (streams or clicks or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
@@ -264,7 +254,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         if overlap and not take.frames and whole > 1.1 * common:
             notes.append(f"all cameras saw {common:.3g} s, the longest {whole:.3g} s")
     elif recordings or clicks:
-        dense = [recording for recording in recordings if not isinstance(recording, LineVideo)]
+        dense = [recording for recording in recordings if not isinstance(recording, observations.LineVideo)]
         frames = take.frames or _span(dense or recordings or clicks, rate)
     else:
         first_time = float(min(times[0] for _, times in marked))
@@ -273,8 +263,8 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         seen = min(starts), max(start + len(m) / m.rate for start, m in zip(starts, shown))
         notes += [note for m, all_of in zip(shown, markers) for note in m.notes[len(all_of.notes) :] if not take.frames]
         frames, marked = take.frames or (round((seen[0] - first_time) * rate), round((seen[1] - first_time) * rate)), []
-    kinds = {LineVideo: "lines of camera ", KeypointVideo: "keypoints of camera ", DepthVideo: "depth ",
-             CloudVideo: "depth "}  # fmt: skip
+    kinds = {observations.LineVideo: "lines of camera ", observations.KeypointVideo: "keypoints of camera "}
+    kinds |= dict.fromkeys((observations.DepthVideo, observations.CloudVideo), "depth ")
     others = [(f"{kinds.get(type(r), '')}{r.sensor}", r.times) for r in (*recordings, *skin)]
     clocks_of_plates = [(plate.name, plate.times - first_time) for plate in plates]
     _check_times([*others, *marked, *clocks_of_plates], frames, rate, take)
@@ -298,7 +288,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     )
 
 
-def _span(recordings: Sequence[SensorRecording], rate: float) -> tuple[int, int]:
+def _span(recordings: Sequence[observations.SensorRecording], rate: float) -> tuple[int, int]:
     """Steps from the first frame of any recording to the last."""
     first, last = min(r.times[0] for r in recordings), max(r.times[-1] for r in recordings)
     return round(float(first) * rate), round(float(last) * rate) + 1
@@ -319,7 +309,9 @@ def _check_times(
             )  # fmt: skip
 
 
-def _read_keypoints(source: KeypointsEntry, cameras: TakeCameras, number: int) -> tuple[Keypoints, NDArray]:
+def _read_keypoints(
+    source: KeypointsEntry, cameras: TakeCameras, number: int
+) -> tuple[observations.Keypoints, NDArray]:
     """Keypoints of a camera, and the times (F,) [s] of their frames from the first on."""
     place = f"[[keypoints]] {number + 1}, camera {source.camera}"
     take, image, rates = cameras.take, cameras.images[source.camera], cameras.rates
@@ -347,10 +339,10 @@ def _read_keypoints(source: KeypointsEntry, cameras: TakeCameras, number: int) -
             place=place, remedy="Remove rate from [[keypoints]]: they take the times of the video's frames.",
         )
     hands_unwanted = source.set == "MEDIAPIPE_33" and record.keypoint_set == "MEDIAPIPE_75"
-    return record.first_points(source.set, MEDIAPIPE_33) if source.set and hands_unwanted else record, times
+    return record.first_points("MEDIAPIPE_33", observations.MEDIAPIPE_33) if hands_unwanted else record, times
 
 
-def _read_markers(entry: MarkersEntry, file: Path) -> Markers:
+def _read_markers(entry: MarkersEntry, file: Path) -> observations.Markers:
     """The marker recording of an entry, or its static trial, in the take's world."""
     markers = read_markers(file, unit=entry.unit)
     markers = markers.sided(entry.sides) if entry.sides else markers
@@ -398,8 +390,8 @@ def _named_apart(plates: Sequence[ForcePlate]) -> tuple[ForcePlate, ...]:
 
 
 def _cut(
-    keypoints: Keypoints, times: NDArray, rate: float, frames: tuple[int, int], entry: KeypointsEntry
-) -> Keypoints:
+    keypoints: observations.Keypoints, times: NDArray, rate: float, frames: tuple[int, int], entry: KeypointsEntry
+) -> observations.Keypoints:
     """Keypoints at the steps [start, stop) of the common time, with what their entry states of ranges of steps."""
     if is_even(times, rate):
         begin = frames[0] - round(keypoints.time_offset * rate)
