@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from kinefit.cli import _screen
+from kinefit.errors import located
 
 
 @click.command(short_help="Count and time jumps, squats and rises from a seat.", epilog="""\b
@@ -20,7 +21,6 @@ Examples:
 def movements(motion: Path, out: Path | None) -> None:
     """Find jumps, squats and rises from a seat in a fitted motion, each with its times and standard deviations."""
     from kinefit._files import writing
-    from kinefit.errors import located
     from kinefit.exporters.movements.found import find_movements, movement_table
     from kinefit.exporters.tables import to_csv
     from kinefit.readers.motion import find_motion, read_motion
