@@ -10,7 +10,9 @@ from types import ModuleType
 from typing import Any
 
 MOVED_PATHS = {
-    "app": "studio.app", "assets": "readers.assets", "batch": "takes.batch", "batch.viewed": "studio.viewers.viewed",
+    "app": "studio.app", "app.served": "studio.app.review", "app.texts": "studio.app.pages.shell",
+    "app.webcams": "studio.app.live", "assets": "readers.assets", "batch": "takes.batch",
+    "batch.cluster": "takes.batch.processes", "batch.viewed": "studio.viewers.viewed",
     "bodies.anny": "bodies.morphs.anny", "bodies.body_surfaces": "bodies.surfaces.places",
     "bodies.joint_names": "bodies.toml.joint_names", "calibration": "rigs",
     "correspondences": "solving.correspondences", "diagnostics": "rigs.diagnostics",
@@ -21,9 +23,11 @@ MOVED_PATHS = {
     "markers.poses": "fitting.markers.poses", "markers.sides": "fitting.markers.sides",
     "markers.subject": "fitting.markers.subject", "motion": "bodies.motion", "multiview": "fitting.multiview",
     "photogrammetry": "images.photogrammetry", "preparing": "takes.preparing",
+    "preparing.ingest": "takes.preparing.take",
     "readers.annotations": "readers.landmarks.annotations", "readers.detections": "readers.landmarks.detections",
-    "readers.keypoint_sets": "readers.landmarks.keypoint_sets", "readers.keypoints": "readers.landmarks.keypoints",
-    "readers.sound": "readers.videos.sound", "readers.video": "readers.videos.video",
+    "readers.guess.depth_cameras": "readers.guess.cameras", "readers.keypoint_sets": "readers.landmarks.keypoint_sets", "readers.keypoints": "readers.landmarks.keypoints",
+    "readers.sound": "readers.videos.sound", "readers.take.clicks": "readers.take.points",
+    "readers.take.skin": "readers.take.points", "readers.video": "readers.videos.video",
     "readers.video_files": "readers.videos.video_files", "recipes": "papers", "rendering": "bodies.rendering",
     "rows": "solving.rows", "serving": "studio.serving", "smoothing": "fitting.smoothing", "solvers": "solving",
     "solvers.sequence": "solving.trajectory.sequence", "subject": "fitting.subject", "tracking": "fitting.tracking",

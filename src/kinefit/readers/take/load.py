@@ -37,7 +37,6 @@ from kinefit.readers.take.cameras import (
     what_is_assumed,
 )
 from kinefit.readers.take.checks import refuse_streams
-from kinefit.readers.take.clicks import load_clicks
 from kinefit.readers.take.depth import depth_notes, load_depth
 from kinefit.readers.take.entries import (
     KeypointsEntry,
@@ -50,7 +49,7 @@ from kinefit.readers.take.entries import (
     title_of,
 )
 from kinefit.readers.take.kinds import KINDS, SensorKind
-from kinefit.readers.take.skin import load_skin
+from kinefit.readers.take.points import load_clicks, load_skin
 from kinefit.readers.videos.video import Video, common_frames
 
 _MIN_COMMON_FRAMES = 10  # without a calibration: fewer tell neither clocks nor places of cameras

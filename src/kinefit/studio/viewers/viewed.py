@@ -24,7 +24,7 @@ from kinefit.sensors.points.views import triangulated
 from kinefit.sensors.settings import TrackSettings
 from kinefit.studio.viewers.show import ViewerContent
 from kinefit.studio.viewers.stage import CameraImages
-from kinefit.takes.batch.inputs import OUTDATED, is_outdated
+from kinefit.takes.batch.corrections import OUTDATED, is_outdated
 from kinefit.takes.batch.results import Step, silent
 from kinefit.takes.missing import find_cameras
 from kinefit.takes.preparing.each_video import Tell

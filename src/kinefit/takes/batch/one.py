@@ -26,7 +26,7 @@ from kinefit.readers.take.checks import check_enough, check_take
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.kinds import kinds_of
 from kinefit.takes.batch import results
-from kinefit.takes.batch.inputs import OUTDATED, inputs_entry, is_outdated
+from kinefit.takes.batch.corrections import OUTDATED, inputs_entry, is_outdated
 from kinefit.takes.batch.processes import progress
 from kinefit.takes.batch.summary import DONE, RECORD, Range, Row, failed, write_people_report
 from kinefit.takes.in_view import InView, people_in_view

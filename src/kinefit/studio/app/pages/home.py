@@ -20,7 +20,6 @@ from kinefit.studio.app.pages import shell as s
 from kinefit.studio.app.pages.result import text_table
 from kinefit.studio.app.pages.take import use_folder
 from kinefit.studio.app.review import Comparison
-from kinefit.studio.app.texts import Texts
 
 _MAX_UPLOAD_BYTES = 2**30  # of a dropped video; larger ones are opened where they are
 _MAX_NAMES = 6  # of videos that are listed
@@ -44,7 +43,7 @@ async def home_page(desk: Desk) -> None:
             ui.button(t("home.demo"), icon="directions_run", on_click=lambda: _demo(desk)).props("flat no-caps")
 
 
-def _ask_faces(desk: Desk, t: Texts) -> None:
+def _ask_faces(desk: Desk, t: s.Texts) -> None:
     def choose(hide: bool) -> None:
         desk.hide_faces = hide
         ui.navigate.reload()
@@ -68,7 +67,7 @@ async def _demo(desk: Desk) -> None:
 class _FolderChoice:
     """A list of folders to walk through by clicks, with a field for a path."""
 
-    def __init__(self, desk: Desk, t: Texts) -> None:
+    def __init__(self, desk: Desk, t: s.Texts) -> None:
         self._desk, self._t, self._at = desk, t, desk.root
         self._field = ui.input(t("home.path"), value=str(self._at)).classes("w-full")
         self._field.on("keydown.enter", lambda: self._go(Path(self._field.value).expanduser()))
@@ -102,7 +101,7 @@ class _FolderChoice:
         use_folder(self._desk, Path(self._field.value).expanduser())
 
 
-def _drop_area(desk: Desk, t: Texts) -> None:
+def _drop_area(desk: Desk, t: s.Texts) -> None:
     folder = desk.root / f"recording-{time.strftime('%Y%m%d-%H%M%S')}"
     ui.label(t("home.drop_text", folder=folder))
 
@@ -127,7 +126,7 @@ def _drop_area(desk: Desk, t: Texts) -> None:
     ).props("accept='video/*,.mkv,.mts,.m2ts,.mxf'").classes("w-full")  # fmt: skip
 
 
-async def _takes(desk: Desk, t: Texts) -> None:
+async def _takes(desk: Desk, t: s.Texts) -> None:
     takes = await s.in_thread(lambda: [(take, take.state) for take in takes_below(desk.root)])
     if others := await s.in_thread(lambda root: takes_below(root, addressable=False), desk.root):
         names = ", ".join(s.short(take.file.parent, desk.root) for take in others[:_MAX_NAMES])
@@ -154,9 +153,6 @@ async def session_page(desk: Desk) -> None:
     """Build the page."""
     t = s.texts()
     with s.shell(desk, t, t("session.title", folder=desk.root)):
-        if desk.hide_faces is None:
-            ui.navigate.to("/")
-            return
         columns = [
             {"name": key, "label": t(f"session.{key}"), "field": key, "sortable": True,
              "align": "left" if key in _TEXTS else "right"} for key in (*_TEXTS, *_NUMBERS)
@@ -180,7 +176,7 @@ async def session_page(desk: Desk) -> None:
         ui.timer(_REFRESH_S, look)
 
 
-def _row(desk: Desk, t: Texts, found: SessionRow) -> dict[str, Any]:
+def _row(desk: Desk, t: s.Texts, found: SessionRow) -> dict[str, Any]:
     """A row of the table: texts, and numbers, by which it is sorted."""
     file = found.take.file
     name = s.short(file.parent if file.name == "take.toml" else file, desk.root)
@@ -195,7 +191,7 @@ def _row(desk: Desk, t: Texts, found: SessionRow) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _state(desk: Desk, t: Texts, found: SessionRow) -> str:
+def _state(desk: Desk, t: s.Texts, found: SessionRow) -> str:
     """That of the last job of the take unless it is done, else that of its files."""
     job = next((job for job in reversed(desk.jobs.jobs) if job.take == found.take.file and job.state != DONE), None)
     if job is None:
@@ -204,14 +200,14 @@ def _state(desk: Desk, t: Texts, found: SessionRow) -> str:
     return t(f"state.{job.state}") + "".join(f" {100 * done:.0f} %" for done in share)
 
 
-def _compute(desk: Desk, t: Texts, table: ui.table) -> None:
+def _compute(desk: Desk, t: s.Texts, table: ui.table) -> None:
     if not table.selected:
         ui.notify(t("session.none"), type="warning")
     for file in dict.fromkeys(row["file"] for row in table.selected):
         desk.start(Path(file), "track", file, "--json")
 
 
-def _compare(t: Texts, table: ui.table) -> None:
+def _compare(t: s.Texts, table: ui.table) -> None:
     keys = {row["key"] for row in table.selected}
     chosen = sorted((row for row in table.rows if row["key"] in keys), key=lambda row: row["date"])
     if len(chosen) != 2 or not all(row["folder"] for row in chosen):
@@ -227,9 +223,6 @@ async def compare_page(desk: Desk, before: Path, after: Path) -> None:
     """Build the page of two folders of results."""
     t = s.texts()
     with s.shell(desk, t, t("compare.title")):
-        if desk.hide_faces is None:
-            ui.navigate.to("/")
-            return
         names = t("compare.before", name=s.short(before, desk.root)), t("compare.after", name=s.short(after, desk.root))
         with ui.row().classes("items-center"):
             for name in names:
@@ -247,7 +240,7 @@ async def compare_page(desk: Desk, before: Path, after: Path) -> None:
             _ranges(t, both)
 
 
-def _angles(t: Texts, both: Comparison, names: tuple[str, str]) -> None:
+def _angles(t: s.Texts, both: Comparison, names: tuple[str, str]) -> None:
     """A choice of an angle, and its two curves from the first frame of each on."""
 
     def draw() -> None:
@@ -271,7 +264,7 @@ def _angles(t: Texts, both: Comparison, names: tuple[str, str]) -> None:
     draw()
 
 
-def _ranges(t: Texts, both: Comparison) -> None:
+def _ranges(t: s.Texts, both: Comparison) -> None:
     ui.label(t("compare.ranges_text")).classes("text-sm")
     columns = [t(f"compare.{key}") for key in ("angle", "range_before", "range_after", "change")]
     rows = ((of.angle, of.before, of.after, "● " * of.is_clear + of.change) for of in both.ranges)

@@ -19,9 +19,8 @@ from kinefit.fitting.initialization.from_clicks import clickable
 from kinefit.studio.app.desk import Desk
 from kinefit.studio.app.pages import shell as s
 from kinefit.studio.app.review import Review
-from kinefit.studio.app.texts import Texts
 from kinefit.takes.batch import corrections
-from kinefit.takes.batch.inputs import is_outdated
+from kinefit.takes.batch.corrections import is_outdated
 from kinefit.takes.batch.results import FORMATS, description, write_format
 
 _REFRESH_S = 0.1  # between two looks at the clock of the 3D figure
@@ -34,9 +33,6 @@ async def result_page(desk: Desk, take: Path, folder: Path) -> None:
     """Build the page of one person's result."""
     t = s.texts()
     with s.shell(desk, t, t("result.title", name=take.parent.name)):
-        if desk.hide_faces is None:
-            ui.navigate.to("/")
-            return
         review = await s.loaded(t, t("result.loading"), desk.review, take, folder)
         if review is not None:
             _ResultPage(desk, t, take, review)
@@ -45,7 +41,7 @@ async def result_page(desk: Desk, take: Path, folder: Path) -> None:
 class _ResultPage:
     """The parts of the page."""
 
-    def __init__(self, desk: Desk, t: Texts, take: Path, review: Review) -> None:
+    def __init__(self, desk: Desk, t: s.Texts, take: Path, review: Review) -> None:
         self._desk, self._t, self._take, self._review = desk, t, take, review
         self._shown = -1
         self._range: list[int | None] = [None, None]

@@ -22,13 +22,12 @@ from kinefit.studio.app.folders import NEW, OUTDATED, UNFINISHED, TakeFolder, vi
 from kinefit.studio.app.jobs import DONE, FAILED, PAUSED, RUNNING, WAITING, Job
 from kinefit.studio.app.pages import shell as s
 from kinefit.studio.app.people import PersonPicture
-from kinefit.studio.app.texts import Texts
 from kinefit.takes.batch import corrections
 
 _CARDS_REFRESH_S = 3.0  # between two looks at what is detected
 
 
-def people_cards(desk: Desk, t: Texts, take: Path, who: ui.select) -> None:
+def people_cards(desk: Desk, t: s.Texts, take: Path, who: ui.select) -> None:
     """Pictures that appear below once there are several people; a click writes the choice into the take file.
 
     `who` is the choice by words, which then stands for what the take file says.
@@ -146,9 +145,6 @@ async def take_page(desk: Desk, path: str) -> None:
     is_asked_for = at in desk.chosen
     desk.chosen.discard(at)
     with s.shell(desk, t, s.short(at, desk.root)):
-        if desk.hide_faces is None:
-            ui.navigate.to("/")
-            return
         first_images(at)
         if at.is_dir() and not takes_in(at):
             guess = await s.loaded(t, t("take.reading"), guess_take, at)
@@ -199,7 +195,7 @@ def opened_take(path: Path, guess: Guess | None) -> tuple[Path, Take, tuple[Note
 class _TakePage:
     """The parts of the page below the images."""
 
-    def __init__(self, desk: Desk, t: Texts, folder: TakeFolder, take: Take, notes: tuple[Note, ...]) -> None:
+    def __init__(self, desk: Desk, t: s.Texts, folder: TakeFolder, take: Take, notes: tuple[Note, ...]) -> None:
         self._desk, self._t, self._folder, self._take, self._notes = desk, t, folder, take, notes
         self._shown: tuple[object, ...] = ()
         with ui.expansion(t("take.found_title"), value=bool(notes)).classes("w-full"):
@@ -398,7 +394,7 @@ class _TakePage:
             ui.link(t("take.check_page"), page, new_tab=True)
 
 
-def _time_left(t: Texts, seconds: float) -> str:
+def _time_left(t: s.Texts, seconds: float) -> str:
     if seconds < 90:
         return t("take.left_seconds", seconds=max(1, round(seconds)))
     return t("take.left", minutes=round(seconds / 60))
