@@ -24,7 +24,7 @@ from kinefit.readers.guess.draft import Draft, Value
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile, KeypointFile
 from kinefit.readers.guess.names import HOW, Trial, trials
 from kinefit.readers.guess.views import keypoint_entries, keypoint_sources, read_sources
-from kinefit.readers.take.cameras import DEFAULT_FIELD_OF_VIEW
+from kinefit.readers.take.cameras import DEFAULT_FIELD_OF_VIEW, turned_frame
 from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.videos.video import Video, common_frames
 from kinefit.readers.videos.video_files import stated_time_code
@@ -258,7 +258,7 @@ def _pictures(
             entry[key] = draft.note_value(f"camera {name}", value, key)
         if relation:
             image = str(relation["image"].value) if "image" in relation else ""
-            images[name] = guess_views.image_frame(rig[name].size, video.size, _turn(relation), image)
+            images[name] = turned_frame(rig[name].size, video.size, _turn(relation), image)
     return images
 
 
