@@ -20,8 +20,8 @@ import numpy as np
 
 from benchmarks.figures import NotMeasured, amount, figure
 from benchmarks.speed.long import write_long_take
-from kinefit.takes.batch.cluster import run_there
 from kinefit.takes.batch.one import Choices, TakeJob
+from kinefit.takes.batch.processes import run_there
 from kinefit.takes.batch.summary import RECORD, Row
 
 TAKES = 10_000

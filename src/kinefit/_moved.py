@@ -10,7 +10,9 @@ from types import ModuleType
 from typing import Any
 
 MOVED_PATHS = {
-    "app": "studio.app", "assets": "readers.assets", "batch": "takes.batch", "batch.viewed": "studio.viewers.viewed",
+    "app": "studio.app", "app.served": "studio.app.review", "app.texts": "studio.app.pages.shell",
+    "app.webcams": "studio.app.live", "assets": "readers.assets", "batch": "takes.batch",
+    "batch.cluster": "takes.batch.processes", "batch.viewed": "studio.viewers.viewed",
     "bodies.anny": "bodies.morphs.anny", "bodies.body_surfaces": "bodies.surfaces.places",
     "bodies.closures": "bodies.tree", "bodies.joint_names": "bodies.toml.joint_names",
     "bodies.surfaces.places.meshes": "bodies.surfaces.places.anchors",
@@ -43,9 +45,11 @@ MOVED_PATHS = {
     "markers.poses": "fitting.markers.subject", "markers.sides": "fitting.markers.sides",
     "markers.subject": "fitting.markers.subject", "markers.take.votes": "markers.take.naming",
     "motion": "bodies.motion", "multiview": "fitting.multiview", "photogrammetry": "images.photogrammetry",
-    "preparing": "takes.preparing", "readers.annotations": "readers.landmarks.annotations",
-    "readers.detections": "readers.landmarks.detections", "readers.keypoint_sets": "readers.landmarks.keypoint_sets",
+    "preparing": "takes.preparing", "preparing.ingest": "takes.preparing.take",
+    "readers.annotations": "readers.landmarks.annotations", "readers.detections": "readers.landmarks.detections",
+    "readers.guess.depth_cameras": "readers.guess.cameras", "readers.keypoint_sets": "readers.landmarks.keypoint_sets",
     "readers.keypoints": "readers.landmarks.keypoints", "readers.sound": "readers.videos.sound",
+    "readers.take.clicks": "readers.take.points", "readers.take.skin": "readers.take.points",
     "readers.video": "readers.videos.video", "readers.video_files": "readers.videos.video_files", "recipes": "papers",
     "rendering": "bodies.rendering", "rigs.bar.placing": "rigs.bar.start", "rigs.bar.report": "rigs.bar.calibrate",
     "rigs.bar.table": "rigs.bar.targets", "rigs.board.intrinsics": "rigs.board.extrinsics",

@@ -29,7 +29,7 @@ COMMANDS = {
     "check": "checks.check", "track": "tracking.track", "live": "tracking.live", "batch": "tracking.track",
     "markers": "markers.markers", "surface": "surfaces.surface", "body": "body", "view": "view", "app": "view",
     "replay": "motions.simulate", "export": "motions.simulate", "retarget": "motions.simulate",
-    "gait": "motions.gait", "movements": "motions.movements",
+    "gait": "motions.gait", "movements": "motions.gait",
     "simulate": "motions.simulate", "evaluate": "motions.simulate", "warmup": "warmup",
 }  # fmt: skip
 """Commands in the order of use, and their modules."""

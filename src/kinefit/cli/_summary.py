@@ -4,27 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from kinefit.bodies.limbs import finger_groups
+from kinefit.bodies.motion import SHOWN_UNITS, Motion, Residuals, known_median
 from kinefit.cli._screen import print_table, say
-from kinefit.findings import frame_ranges
+from kinefit.exporters.report.fit import point_medians, sensor_fits, value_text
+from kinefit.exporters.report.methods import joint_distances
+from kinefit.exporters.report.moments import doubt_sentence, doubtful_moments, throughout_sentence, unmarked, when
+from kinefit.findings import FINDINGS, frame_ranges
 from kinefit.takes.batch.results import description
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from kinefit.bodies.motion import Motion, Residuals
 
 MOMENTS = 5  # doubtful moments that are listed, the worst first
 
 
 def print_summary(motion: Motion, *, points: bool = False) -> None:
     """Print it; with `points`, the residual of every point in every camera too."""
-    from kinefit.exporters.report.fit import sensor_fits, value_text
-    from kinefit.exporters.report.moments import doubt_sentence, doubtful_moments, throughout_sentence, when
-
     seconds = len(motion) / motion.rate
     say(f"\n{motion.name}: {len(motion)} frames at {motion.rate:g} Hz ({seconds:.2f} s), body {motion.body.name}")
     if motion.residuals:
@@ -63,8 +61,6 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
 
 def as_record(motion: Motion, notes: Iterable[str], files: Mapping[str, Path]) -> dict[str, Any]:
     """The summary for programs: `kinefit track --json`."""
-    from kinefit.findings import FINDINGS
-
     return {
         "name": motion.name, "frames": len(motion), "rate_hz": motion.rate, "body": motion.body.name,
         "quality": round(float(motion.quality.mean()), 4),
@@ -85,8 +81,6 @@ def print_files(files: Mapping[str, Path]) -> None:
 
 def lost_segments(motion: Motion) -> dict[str, NDArray]:
     """Segments that are lost, and in which frames somebody was tracked all the same; not those that bore no markers."""
-    from kinefit.exporters.report.moments import unmarked
-
     return _frames_of(motion, motion.lost & (motion.quality > 0)[:, None] & ~unmarked(motion))
 
 
@@ -98,8 +92,6 @@ def _frames_of(motion: Motion, gone: NDArray) -> dict[str, NDArray]:
 
 def _hands_together(motion: Motion, gone: Mapping[str, NDArray]) -> dict[str, NDArray]:
     """Segments -> frames; of each hand all its fingers as one, in frames in which any of them is gone."""
-    from kinefit.bodies.limbs import finger_groups
-
     out = dict(gone)
     for hand, segments in finger_groups(motion.body).items():
         if frames := [out.pop(s) for s in segments if s in out]:
@@ -109,30 +101,22 @@ def _hands_together(motion: Motion, gone: Mapping[str, NDArray]) -> dict[str, ND
 
 def without_markers(motion: Motion) -> dict[str, NDArray]:
     """Segments without markers, in frames of which none is seen: they hang on their neighbours."""
-    from kinefit.exporters.report.moments import unmarked
-
     return _frames_of(motion, unmarked(motion))
 
 
 def bone_lengths(motion: Motion) -> dict[str, str]:
     """Distances [cm] from joint to joint, one for left and right where they are alike."""
-    from kinefit.exporters.report.methods import joint_distances
-
     found = joint_distances(motion.body)
     return {name: "/".join(dict.fromkeys(f"{cm:.1f}" for cm, _ in of.values())) for name, of in found.items()}
 
 
 def _median_of(r: Residuals) -> float | None:
     """Median length of the residuals, in their unit; None where no point was seen."""
-    from kinefit.bodies.motion import known_median
-
     median = known_median(r.norms)
     return median if np.isfinite(median) else None
 
 
 def _print_points(motion: Motion) -> None:
-    from kinefit.bodies.motion import SHOWN_UNITS
-    from kinefit.exporters.report.fit import point_medians
 
     names = list(dict.fromkeys(name for r in motion.residuals.values() for name in r.names))
     medians = [(point_medians(r), SHOWN_UNITS[r.unit][1]) for r in motion.residuals.values()]

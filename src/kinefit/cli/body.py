@@ -9,6 +9,7 @@ import click
 
 from kinefit.cli import _screen
 from kinefit.cli._screen import CommandGroup
+from kinefit.errors import FileError
 
 
 @click.group(cls=CommandGroup, short_help="List, copy and render bodies; check closed chains.",
@@ -43,7 +44,6 @@ def body(ctx: click.Context) -> None:
 def copy(name: str, file: Path | None) -> None:
     """Write a body of the catalogue as a TOML file that you can edit."""
     from kinefit.bodies.toml.bodies import catalogue_text
-    from kinefit.errors import FileError
 
     text, target = catalogue_text(name), file or Path(f"{name}.toml")
     if target.exists():
@@ -109,7 +109,6 @@ def picture(file: str, out: Path, azimuth: float) -> None:
     """Render a body in the pose nearest to its reference pose that satisfies its closures."""
     from kinefit._files import write_image
     from kinefit.bodies import load_body
-    from kinefit.errors import FileError
     from kinefit.simulation.figures import portrait
 
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from kinefit.cli import _screen
-from kinefit.errors import TakeError, TrackingError, choices
+from kinefit.errors import TakeError, TrackingError, choices, command
 
 if TYPE_CHECKING:
     from kinefit.bodies import Body
@@ -59,7 +59,6 @@ def init(
     if body is not None and not (clicked or points):
         raise click.UsageError("--body needs --click or --points; without them, write body into the take file.")
     from kinefit._files import write_text
-    from kinefit.errors import TakeError, command
     from kinefit.readers.guess.folder import guess_take
 
     out = out or folder / "take.toml"
@@ -72,7 +71,7 @@ def init(
     write_text(out, guess.text)
     show(guess.notes)
     if hide_faces:
-        from kinefit.takes.preparing.ingest import hide_in_copies
+        from kinefit.takes.preparing.take import hide_in_copies
 
         with _screen.bars() as progress:
             copies = hide_in_copies(out, progress, _screen.note)

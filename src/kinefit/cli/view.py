@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from kinefit.cli import _screen
+from kinefit.errors import FileError, printable
 
 if TYPE_CHECKING:
     from kinefit.studio.serving.access import Access
@@ -108,7 +109,6 @@ def app(folder: Path, port: int, token: str | None, browser: bool) -> None:
     here ends the app, and what is computed goes on from there the next time. Needs the extra `app`:
     pip install 'kinefit[app]'.
     """
-    from kinefit.errors import FileError, printable
     from kinefit.studio.app.server import serve
     from kinefit.studio.serving.access import Access
 

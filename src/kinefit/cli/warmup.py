@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from kinefit.cli import _screen
+from kinefit.errors import AssetError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,7 +31,6 @@ def warmup() -> None:
     """
     from kinefit._jit import kernel_folder
     from kinefit._threads import Pool
-    from kinefit.errors import AssetError
     from kinefit.readers import assets
 
     begin = perf_counter()

@@ -27,14 +27,8 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import writing
-from kinefit.bodies.motion import (
-    Motion,
-    angle_columns,
-    continuous_quaternions,
-    joint_columns,
-    place_columns,
-    rotation_between_up,
-)
+from kinefit.bodies import motion as motions
+from kinefit.bodies.motion import Motion
 from kinefit.errors import ExportError, extra
 from kinefit.exporters.opensim import root_coordinates
 from kinefit.exporters.skeletons.common import UNITS, bone_names, euler_zxy, length_factor, turned
@@ -69,7 +63,7 @@ def curves(motion: Motion) -> list[Curve]:
     tree, y_up = motion.body.tree, motion.turned("y")
     names, speeds = root_coordinates(motion.body), _speeds(motion)
     turns, turns_std, slopes = _root_turns(y_up)
-    R, ones, out = rotation_between_up(motion.up, "y"), np.ones((len(motion), 1)), []
+    R, ones, out = motions.rotation_between_up(motion.up, "y"), np.ones((len(motion), 1)), []
     by_radians = np.degrees(ones)
     if tree.root_free:
         columns = [*turns.T, *y_up.Ts_world_root[:, :3, 3].T]
@@ -261,11 +255,11 @@ def _in_pieces(motion: Motion, unit: str, up: str | None, names: str | None) -> 
     start = {"frame": np.arange(len(motion)), "time [s]": motion.times}
     stretches = [slice(row, row + _ROWS) for row in range(0, max(len(motion), 1), _ROWS)]
 
-    turns = continuous_quaternions(motion.Ts_world_root[:, :3, :3])  # their signs go on from part to part
+    turns = motions.continuous_quaternions(motion.Ts_world_root[:, :3, :3])  # their signs go on from part to part
     quaternions = {f"root_q{part}": turns[:, i] for i, part in enumerate("wxyz")}
 
     def angles() -> Iterator[Table]:
-        for some, piece in zip(stretches, of_parts(lambda part: angle_columns(part, factor, unit))):
+        for some, piece in zip(stretches, of_parts(lambda part: motions.angle_columns(part, factor, unit))):
             yield piece | {name: column[some] for name, column in quaternions.items()}
 
     def of_parts(columns: Callable[[Motion], Table]) -> Iterator[Table]:
@@ -273,14 +267,14 @@ def _in_pieces(motion: Motion, unit: str, up: str | None, names: str | None) -> 
             yield {name: column[some] for name, column in start.items()} | columns(part)
 
     def landmarks(part: Motion) -> Table:
-        return place_columns(body.landmarks.names, factor * part.positions(), unit)
+        return motions.place_columns(body.landmarks.names, factor * part.positions(), unit)
 
     def quality(part: Motion) -> Table:
         return {"quality": part.quality, **{name: part.segment_quality[:, s] for s, name in enumerate(segments)}}
 
     residuals = _long(lambda sensor, frames: _residuals(motion, sensor, frames, factor, unit, segments), motion)
     return {
-        "angles": angles(), "joints": of_parts(lambda part: joint_columns(part, bones, factor, unit)),
+        "angles": angles(), "joints": of_parts(lambda part: motions.joint_columns(part, bones, factor, unit)),
         "landmarks": of_parts(landmarks), "quality": of_parts(quality), "residuals": residuals,
     }  # fmt: skip
 

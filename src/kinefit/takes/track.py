@@ -16,17 +16,11 @@ from kinefit.exporters.report.feet import plate_faults
 from kinefit.fitting.smoothing.online.fixed_lag import KnownNoise
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.subject.subject import Subject
+from kinefit.fitting.tracking import take_recording
 from kinefit.fitting.tracking.cameras import as_found
 from kinefit.fitting.tracking.checkpoints.checkpoint import Checkpoint, TrackingInterrupted
 from kinefit.fitting.tracking.recording import Recording
 from kinefit.fitting.tracking.sizing import channels_of
-from kinefit.fitting.tracking.take_recording import (
-    label_findings_of,
-    on_floor,
-    recording_of,
-    rig_on_floor,
-    with_fitted_start,
-)
 from kinefit.fitting.tracking.video import Progress, track
 from kinefit.markers.take.takes import with_names
 from kinefit.readers.calibration.read import found_notes
@@ -89,13 +83,13 @@ def track_take(
         )  # fmt: skip
     body = with_bands_of(take, body)
     with naming_plugins(((one.recording.sensor, one.kind) for one in seen.sensors), take.path):
-        recording, body = recording_of(take, seen, body, view.people if view else None)
+        recording, body = take_recording.recording_of(take, seen, body, view.people if view else None)
         settings = settings_of(take, settings)
         if view is not None:
             recording = view.recording(recording, body, take.person, settings)
         if take.pose is not None:
-            recording = with_fitted_start(recording, body, settings, low_pass=take.pose.low_pass)
-        labels = label_findings_of(take, seen, body, refuse=True)
+            recording = take_recording.with_fitted_start(recording, body, settings, low_pass=take.pose.low_pass)
+        labels = take_recording.label_findings_of(take, seen, body, refuse=True)
         followed = recording.followed.keypoints if recording.followed else ()
         findings = (*labels, *input_findings(take, seen, followed, body))
         try:
@@ -111,9 +105,9 @@ def track_take(
             raise with_cause(error, findings) from error
     motion = replace(motion.with_mass(_mass_of(take, seen, motion.body)), plates=seen.plates)
     motion = with_findings(motion, (*findings, *plate_faults(motion)), seen, take.height)
-    motion = on_floor(motion, recording, view.floors if view else [])
+    motion = take_recording.on_floor(motion, recording, view.floors if view else [])
     if seen.rig is not None:
-        seen = replace(seen, rig=rig_on_floor(as_found(seen.rig, motion.provenance), motion.provenance))
+        seen = replace(seen, rig=take_recording.rig_on_floor(as_found(seen.rig, motion.provenance), motion.provenance))
     return motion, seen
 
 

@@ -5,7 +5,7 @@ import pytest
 from tests.exporters.movements.synthetic import SEAT, SQUAT, crouching, times_down
 
 from kinefit.exporters.movements.course import Course
-from kinefit.exporters.movements.sit_to_stand import rises
+from kinefit.exporters.movements.found import rises
 
 
 def test_rises_are_counted_and_timed():

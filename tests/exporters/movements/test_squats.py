@@ -5,7 +5,7 @@ import pytest
 from tests.exporters.movements.synthetic import SEAT, SQUAT, crouching, jumping, times_down
 
 from kinefit.exporters.movements.course import Course, Repetition
-from kinefit.exporters.movements.squats import squats
+from kinefit.exporters.movements.found import squats
 
 
 @pytest.mark.parametrize("count", [1, 3])

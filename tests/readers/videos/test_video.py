@@ -1,6 +1,7 @@
 """Videos are read frame-exactly, upright and in step; damaged ones are refused with what can be read."""
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from fractions import Fraction
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import FileError, ObservationError
-from kinefit.readers.videos.video import Video, VideoSet, common_frames
+from kinefit.readers.videos.video import Video, common_frames
 from kinefit.readers.videos.video_files import _display_axes, first_image, stated_time_code
 
 COUNT, WIDTH, HEIGHT = 40, 160, 96
@@ -136,24 +137,36 @@ def test_real_mp4_with_its_index_in_front_but_cut(data_dir, tmp_path):
 def test_real_videos(data_dir):
     folder = data_dir("video_balancing_4cam") / "videos"
     paths = {f"cam0{i}": folder / f"cam0{i}.mp4" for i in (1, 2, 3, 4)}
-    with VideoSet(paths) as videos:
-        assert len(videos) == 100
-        assert videos.rate == 60
-        assert [v.size for v in videos.videos.values()] == [(1080, 1920)] * 2 + [(1088, 1920)] * 2
-        late = videos.read(57)
+    with ExitStack() as opened:
+        videos = {name: opened.enter_context(Video(path)) for name, path in paths.items()}
+        assert common_frames({name: video.times for name, video in videos.items()}, 60) == (0, 100)
+        assert {video.rate for video in videos.values()} == {60}
+        assert [video.size for video in videos.values()] == [(1080, 1920)] * 2 + [(1088, 1920)] * 2
+        late = {name: video.read(57) for name, video in videos.items()}
         assert late["cam03"].shape == (1920, 1088, 3)
     with Video(paths["cam02"]) as video:
         in_order = list(video.frames(0, 58))[57]
     np.testing.assert_array_equal(late["cam02"], in_order)
 
 
+def in_step(paths, offsets=(0.0, 0.0), frames=None):
+    """Steps that all videos share, of the highest rate, and the numbers that each shows in them."""
+    with ExitStack() as opened:
+        videos = {name: opened.enter_context(Video(path)) for name, path in paths.items()}
+        rate = max(video.rate for video in videos.values())
+        clocks = {name: video.times + offset for (name, video), offset in zip(videos.items(), offsets, strict=True)}
+        start, stop = common_frames(clocks, rate, frames)
+        return (start, stop), [
+            [number(video.read(video.frame_at(t - offset) or 0)) for video, offset in zip(videos.values(), offsets)]
+            for t in np.arange(start, stop) / rate
+        ]
+
+
 def test_cameras_in_step_with_time_offsets(tmp_path):
     paths = {"a": write(tmp_path / "a.mp4"), "b": write(tmp_path / "b.mp4", first=0)}
-    with VideoSet(paths, {"b": 0.1}) as videos:  # b started three frames after a
-        assert len(videos) == COUNT - 3
-        np.testing.assert_allclose(videos.times[[0, -1]], [3 / 30, 39 / 30])
-        steps = [(number(images["a"]), number(images["b"])) for images in videos]
-    assert steps == [(k + 3, k) for k in range(COUNT - 3)]
+    steps, shown = in_step(paths, (0.0, 0.1))  # b started three frames after a
+    assert steps == (3, COUNT)
+    assert shown == [[k + 3, k] for k in range(COUNT - 3)]
 
 
 DROPPED = [i for i in range(40) if not (12 <= i < 26 and i % 2)]  # frames that a telephone kept
@@ -281,22 +294,16 @@ def test_of_two_frames_at_one_time_the_first_is_shown(tmp_path):
 def test_streams_of_different_length_or_rate(tmp_path):
     long, short = write(tmp_path / "long.mp4"), write(tmp_path / "short.mp4", count=25)
     with pytest.raises(ObservationError, match="a 40 frames, b 25 frames") as caught:
-        VideoSet({"a": long, "b": short})
+        in_step({"a": long, "b": short})
     assert "frames = [0, 25]" in caught.value.remedy
-    with VideoSet({"a": long, "b": short}, frames=(5, 25)) as videos:
-        assert [number(images["b"]) for images in videos] == list(range(5, 25))
+    assert [b for _, b in in_step({"a": long, "b": short}, frames=(5, 25))[1]] == list(range(5, 25))
     with pytest.raises(ObservationError, match=r"\[0, 30\]"):
-        VideoSet({"a": long, "b": short}, frames=(0, 30))
-    slow = write(tmp_path / "c.mp4", rate=15, count=20)
-    with VideoSet({"a": long, "c": slow}) as videos:
-        assert videos.rate == 30 and len(videos) == 39  # to the slow one's last frame
-        assert [number(videos.read(i)["c"]) for i in (0, 2, 10, 38)] == [0, 1, 5, 19]
+        in_step({"a": long, "b": short}, frames=(0, 30))
+    steps, shown = in_step({"a": long, "c": write(tmp_path / "c.mp4", rate=15, count=20)})
+    assert steps == (0, 39)  # to the slow one's last frame
+    assert [shown[i][1] for i in (0, 2, 10, 38)] == [0, 1, 5, 19]
     with pytest.raises(ObservationError, match="a 40 frames, c 79 frames of 30 Hz"):
-        VideoSet({"a": long, "c": write(tmp_path / "c.mp4", rate=15)})
-    with pytest.raises(ObservationError, match="no camera 'z'"):
-        VideoSet({"a": long}, {"z": 1.0})
-    with pytest.raises(ObservationError, match="no videos"):
-        VideoSet({})
+        in_step({"a": long, "c": write(tmp_path / "c.mp4", rate=15)})
 
 
 def test_common_frames_without_overlap():

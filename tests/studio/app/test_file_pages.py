@@ -5,7 +5,7 @@ import urllib.request
 
 import pytest
 
-from kinefit.studio.app.served import FilePages
+from kinefit.studio.app.review import FilePages
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from kinefit.studio.app.folders import (
     video_files,
 )
 from kinefit.takes.batch import corrections
-from kinefit.takes.batch.inputs import inputs_entry
+from kinefit.takes.batch.corrections import inputs_entry
 
 
 def take_in(folder):

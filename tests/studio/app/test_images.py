@@ -3,7 +3,8 @@
 import cv2
 import numpy as np
 
-from kinefit.studio.app.people import jpeg, scaled, unrecognisable
+from kinefit.exporters.report.page import scaled
+from kinefit.studio.app.people import jpeg, unrecognisable
 
 
 def test_the_longer_side_is_bounded_and_nothing_is_enlarged():

@@ -13,10 +13,19 @@ from tests.studio.viewers.recordings import write_take
 from kinefit.errors import FileError, ObservationError
 from kinefit.readers.take.file import read_take
 from kinefit.readers.videos.video import Video
-from kinefit.studio.app import webcams
+from kinefit.studio.app import live as webcams
 from kinefit.studio.app.jobs import DONE, PAUSED, JobQueue
-from kinefit.studio.app.live import followable, found_cameras, is_up, page_of, recorded_take, start_live
-from kinefit.studio.app.webcams import Recorder, find_webcams, write_live_take
+from kinefit.studio.app.live import (
+    Recorder,
+    find_webcams,
+    followable,
+    found_cameras,
+    is_up,
+    page_of,
+    recorded_take,
+    start_live,
+    write_live_take,
+)
 
 STUDIO = '[take]\nname = "studio"\nrate = 30.0\nup = "z"\n'
 

@@ -4,7 +4,7 @@ import string
 
 import pytest
 
-from kinefit.studio.app.texts import LANGUAGES, Texts, preferred_language, words
+from kinefit.studio.app.pages.shell import LANGUAGES, Texts, preferred_language, words
 
 
 def placeholders(text):

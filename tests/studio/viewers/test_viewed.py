@@ -10,7 +10,7 @@ from kinefit.readers.take.file import read_take
 from kinefit.simulation import cut, squat_and_wave
 from kinefit.studio.viewers.viewed import gather
 from kinefit.takes.batch import corrections
-from kinefit.takes.batch.inputs import OUTDATED, inputs_entry, is_outdated
+from kinefit.takes.batch.corrections import OUTDATED, inputs_entry, is_outdated
 
 
 @pytest.fixture

@@ -10,8 +10,7 @@ from tests.takes.batch.test_many import CHOICES, contents, drawn_sessions, sessi
 
 from kinefit import track_takes
 from kinefit.errors import ExportError
-from kinefit.takes.batch.cluster import run_there
-from kinefit.takes.batch.processes import Failure
+from kinefit.takes.batch.processes import Failure, run_there
 from kinefit.takes.batch.summary import RECORD
 
 __all__ = ["drawn_sessions", "sessions"]
@@ -47,7 +46,7 @@ def test_an_error_is_told_and_stops_no_other(cluster):
 
 
 def test_workers_with_another_kinefit_are_refused(cluster, monkeypatch):
-    from kinefit.takes.batch import cluster as module
+    from kinefit.takes.batch import processes as module
 
     monkeypatch.setattr(module, "code_digest", lambda calls=[]: calls.append(1) or len(calls))
     with pytest.raises(ExportError, match="another version of kinefit"):
@@ -56,7 +55,7 @@ def test_workers_with_another_kinefit_are_refused(cluster, monkeypatch):
 
 def test_no_scheduler_is_told(monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("kinefit.takes.batch.cluster._CONNECT_TIMEOUT", 0.3)
+    monkeypatch.setattr("kinefit.takes.batch.processes._CONNECT_TIMEOUT", 0.3)
     with pytest.raises(ExportError, match="no Dask scheduler answers"):
         results(jobs.square, [1], "tcp://127.0.0.1:9")
     with pytest.raises(ExportError, match="no Dask scheduler answers"):

@@ -10,7 +10,7 @@ from kinefit.observations import Detections
 from kinefit.readers.take.file import read_take
 from kinefit.readers.videos.video import Video
 from kinefit.takes.preparing import detecting, faces
-from kinefit.takes.preparing.ingest import FOLDER, hide_in_copies
+from kinefit.takes.preparing.take import FOLDER, hide_in_copies
 
 
 class SeesMiddle:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from kinefit.cli import _screen
+from kinefit.errors import KinefitError
 
 if TYPE_CHECKING:
     from kinefit.cli.checks._refine import Refined
@@ -59,7 +60,6 @@ def check(
     from kinefit.cli._screen import check_file
     from kinefit.cli.checks._page import check_page
     from kinefit.cli.checks._refine import refined_of, write_refined
-    from kinefit.errors import KinefitError
     from kinefit.findings import as_records, fixes, in_words, ranked
     from kinefit.readers.take.file import find_take
     from kinefit.takes.batch.corrections import write_edits

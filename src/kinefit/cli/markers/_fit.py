@@ -7,40 +7,38 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from kinefit._files import write_rows, write_text
 from kinefit.bodies import Body, PointSet, load_body
 from kinefit.bodies.marker_sets import bare, find_marker_set, load_marker_set, matched
 from kinefit.bodies.motion import Motion, rotation_between_up
 from kinefit.cli import _screen
 from kinefit.cli._screen import Step, check_file, note
 from kinefit.errors import KinefitError, ObservationError, located
+from kinefit.exporters import write_markers, write_osim, write_trc
+from kinefit.exporters.gait.plates import standing_mass, stood_on
+from kinefit.exporters.report.feet import plate_faults
+from kinefit.exporters.report.report import write_report
 from kinefit.exporters.skeletons.common import plain_names
 from kinefit.findings import FINDINGS, Finding, as_records, faults_of
-from kinefit.fitting.markers.subject import MarkerSubject
+from kinefit.fitting.markers.first_set import FirstSet, first_set
+from kinefit.fitting.markers.sides import label_findings, refuse_wrong_sides
+from kinefit.fitting.markers.subject import MarkerSubject, fit_marker_subject, split_people
+from kinefit.fitting.tracking.video import fit_markers
 from kinefit.markers.model.from_frame import model_from_frame
 from kinefit.markers.model.learn import TrainingFinding, learn_model, training_gate
 from kinefit.markers.model.model import MarkerModel, load_model
-from kinefit.markers.take.takes import (
-    TakeIdentification,
-    TakeSettings,
-    identify_people,
-    identify_take,
-    one_after_the_other,
-)
+from kinefit.markers.take import takes
 from kinefit.observations import Markers
+from kinefit.readers.markers import read_markers
+from kinefit.rigs.diagnostics.quick import motion_findings
 from kinefit.takes.batch.results import FORMATS, check_formats, description, write_results
-
-if TYPE_CHECKING:
-    from kinefit.fitting.markers.first_set import FirstSet
 
 
 def read_file(path: str | PathLike[str], unit: str | None) -> Markers:
     """Read markers of a C3D or TRC file, and print what the reader notes on it."""
-    from kinefit.readers.markers import read_markers
-
     markers = read_markers(path, unit=unit)
     for text in markers.notes:
         note(f"{text}.")
@@ -64,7 +62,7 @@ def learn_files(
     KinefitError
         A file cannot be read, its labels do not fit the marker set, or no frame shows enough.
     """
-    markers = one_after_the_other([read_file(path, unit) for path in paths])
+    markers = takes.one_after_the_other([read_file(path, unit) for path in paths])
     name = name or Path(paths[0]).stem
     if frame is None:
         model = learn_model(markers, name=name, template=marker_set)
@@ -95,10 +93,7 @@ def write_first_set(
     KinefitError
         A file cannot be read or written, or shows too little.
     """
-    from kinefit._files import write_text
-    from kinefit.fitting.markers.first_set import first_set
-
-    markers = one_after_the_other([read_file(path, unit) for path in paths])
+    markers = takes.one_after_the_other([read_file(path, unit) for path in paths])
     found = first_set(markers, body=load_body("humanoid"), name=name or Path(out).stem.upper())
     write_text(Path(out), found.text)
     return found
@@ -109,12 +104,12 @@ def identify_file(
     model: MarkerModel | str | PathLike[str] | Sequence[MarkerModel | str | PathLike[str]],
     out: str | PathLike[str] | None = None,
     *,
-    settings: TakeSettings | None = None,
+    settings: takes.TakeSettings | None = None,
     unit: str | None = None,
     rest: bool = False,
     step: Step | None = None,
-    method: Callable[..., TakeIdentification] = identify_take,
-) -> tuple[Markers, dict[str, TakeIdentification], dict[str, Path]]:
+    method: Callable[..., takes.TakeIdentification] = takes.identify_take,
+) -> tuple[Markers, dict[str, takes.TakeIdentification], dict[str, Path]]:
     """Name the markers of a file and write it with labels, with a table of doubtful frames beside it.
 
     Parameters
@@ -137,16 +132,13 @@ def identify_file(
     KinefitError
         A file cannot be read or written, or no subject is found.
     """
-    from kinefit._files import write_rows
-    from kinefit.exporters import write_markers
-
     source = Path(path)
     target = Path(out) if out is not None else source.with_name(f"{source.stem}-named{source.suffix}")
     check_file(target)
     given = [model] if isinstance(model, MarkerModel | str | PathLike) else list(model)
     models = [m if isinstance(m, MarkerModel) else load_model(m) for m in given]
     markers = read_file(source, unit)
-    found = identify_people(models, markers, settings=settings, progress=step, method=method)
+    found = takes.identify_people(models, markers, settings=settings, progress=step, method=method)
     labelled = _together(models, found, markers, rest)
     both_c3d = source.suffix.lower() == target.suffix.lower() == ".c3d"
     write_markers(labelled, target, like=source if both_c3d else None)
@@ -156,7 +148,9 @@ def identify_file(
     return labelled, named, {"markers": target, "doubts": doubts}
 
 
-def _together(models: list[MarkerModel], found: list[TakeIdentification], markers: Markers, rest: bool) -> Markers:
+def _together(
+    models: list[MarkerModel], found: list[takes.TakeIdentification], markers: Markers, rest: bool
+) -> Markers:
     """One take of all subjects; with `rest` the points of nobody."""
     parts = [f.markers(markers) for f in found]
     if len(models) > 1:
@@ -184,7 +178,7 @@ def _prefixed(name: str, label: str) -> str:
     return f"{name}:{bare(label)}"
 
 
-def _doubts(found: dict[str, TakeIdentification], markers: Markers, many: bool) -> Iterator[Sequence[object]]:
+def _doubts(found: dict[str, takes.TakeIdentification], markers: Markers, many: bool) -> Iterator[Sequence[object]]:
     """Rows of doubtful frames, worst first; frames as the file counts them."""
     rows = sorted((d.confidence, d.first, name, d) for name, f in found.items() for d in f.doubts)
     yield "first_frame", "last_frame", "first_time", "last_time", "label", "kind", "confidence"
@@ -197,9 +191,6 @@ def _doubts(found: dict[str, TakeIdentification], markers: Markers, many: bool) 
 
 def check_labels(markers: Markers, marker_set: str | None) -> list[Finding]:
     """Check sides and labels of every person of a take on the humanoid, where it has the labels (`label_findings`)."""
-    from kinefit.fitting.markers.sides import label_findings
-    from kinefit.fitting.markers.subject import split_people
-
     found: list[Finding] = []
     for person in split_people(markers).values():
         with suppress(KinefitError):  # labels of a model or of a set without places on a body
@@ -268,15 +259,6 @@ def fit_file(
         A file cannot be read or written, too few labels are known, no frame shows enough (see `fit_markers`), or left
         and right are wrong (see `label_findings`).
     """
-    from kinefit.exporters import write_markers, write_osim, write_trc
-    from kinefit.exporters.gait.plates import standing_mass, stood_on
-    from kinefit.exporters.report.feet import plate_faults
-    from kinefit.exporters.report.report import write_report
-    from kinefit.fitting.markers.sides import label_findings, refuse_wrong_sides
-    from kinefit.fitting.markers.subject import fit_marker_subject
-    from kinefit.fitting.tracking.video import fit_markers
-    from kinefit.rigs.diagnostics.quick import motion_findings
-
     step, formats, options = step or (lambda what, done, total: None), tuple(formats), options or MarkerFitOptions()
     folder = out if out is not None else path.with_name(f"{path.stem}-kinefit")
     check_formats(name for name in formats if name not in ("markers", "report"))
@@ -364,8 +346,6 @@ def worn_body(subject: MarkerSubject, labels: Iterable[str]) -> Body:
 
 def read_people(file: Path, unit: str | None, sides: str | None = None) -> dict[str, Markers]:
     """The people of a file, by the prefix of their labels, with left and right as `sides` states (see `read_sides`)."""
-    from kinefit.fitting.markers.subject import split_people
-
     markers = read_file(file, unit)
     if sides:
         with located(file):

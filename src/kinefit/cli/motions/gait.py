@@ -1,4 +1,4 @@
-"""`kinefit gait`: the gait record of one person's walks."""
+"""`kinefit gait`: the gait record of a person's walks; `kinefit movements`: jumps, squats, rises, counted and timed."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import click
 
 from kinefit.cli import _screen
+from kinefit.errors import located
 
 if TYPE_CHECKING:
     from kinefit.exporters.gait.record import GaitRecord
+
 
 _CONTENTS = {
     "csv": "all strides and steps", "parquet": "the same", "json": "means, symmetry, variability",
@@ -84,3 +86,33 @@ def _print(record: GaitRecord) -> None:
     _screen.print_table((f"{walk}, mean ± σ", "left", "n", "right", "n", "L−R [%]"), rows)
     if turned:
         _screen.say(f"{turned} strides and steps in turns are in the files alone.")
+
+
+@click.command(short_help="Count and time jumps, squats and rises from a seat.", epilog="""\b
+Examples:
+  kinefit movements squats-kinefit
+  kinefit movements jump-kinefit/motion.npz --out jump.csv
+""")  # fmt: skip
+@click.argument("motion", type=_screen.PATH)
+@click.option("-o", "--out", type=_screen.PATH, metavar="CSV", help="[default: movements.csv next to MOTION]")
+@_screen.verbose_option
+def movements(motion: Path, out: Path | None) -> None:
+    """Find jumps, squats and rises from a seat in a fitted motion, each with its times and standard deviations."""
+    from kinefit._files import writing
+    from kinefit.exporters.movements.found import find_movements, movement_table
+    from kinefit.exporters.tables import to_csv
+    from kinefit.readers.motion import find_motion, read_motion
+
+    file = find_motion(motion)
+    target = out or file.with_name("movements.csv")
+    _screen.check_file(target)
+    with located(file):
+        found = find_movements(read_motion(file))
+    with writing(target) as temporary:
+        to_csv([movement_table(found)], temporary)
+    counts = {kind: sum(one.kind == kind for one in found) for kind in dict.fromkeys(one.kind for one in found)}
+    _screen.say(", ".join(f"{kind}: {count}" for kind, count in counts.items()) or "no jump, squat or rise from a seat")
+    for one in found:
+        values = ", ".join(f"{name} {value:.3g} ± {std:.2g}" for name, (value, std) in one.values.items())
+        _screen.say(f"  {one.start:.2f} to {one.stop:.2f} s, {one.kind}: {values}")
+    _screen.say(f"{target}: one row each")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from kinefit.cli import _screen
-from kinefit.errors import spelled
+from kinefit.errors import command, spelled
 from kinefit.takes.batch.results import FORMATS, OPTIONS, description, write_format
 
 if TYPE_CHECKING:
@@ -196,7 +196,6 @@ def simulate(
     """
     import math
 
-    from kinefit.errors import command
     from kinefit.exporters import write_csv, write_motion
     from kinefit.simulation import cut, write_recording
 

@@ -18,17 +18,7 @@ from kinefit._files import regular
 from kinefit._pictures import read_picture
 from kinefit.bodies.motion import Motion
 from kinefit.errors import CalibrationError, FileError, ObservationError, TrackingError, shortened
-from kinefit.exporters.surface_files import (
-    point_columns,
-    write_field_picture,
-    write_paths_csv,
-    write_paths_picture,
-    write_point_picture,
-    write_points_csv,
-    write_returns_csv,
-    write_surface_vtk,
-    write_velocity_picture,
-)
+from kinefit.exporters import surface_files
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.photogrammetry.least_squares_matching import MIN_CORRELATION, Grid, Seeds, windows_by_texture
 from kinefit.images.photogrammetry.points.bright_points import BrightPointTracker
@@ -335,20 +325,21 @@ def _write(
                 f"   {kind} over {1e3 * strain.gauge:.2f} mm, RMS: xx {levels['xx']:.0f}e-6, yy {levels['yy']:.0f}e-6, "
                 f"xy {levels['xy']:.0f}e-6"
             )
-    columns = point_columns(surface, reference, strain, window)
-    write_points_csv(surface, out / f"points_{k:03d}.csv", columns)
-    write_surface_vtk(surface, out / f"surface_{k:03d}.vtk", columns)
+    columns = surface_files.point_columns(surface, reference, strain, window)
+    surface_files.write_points_csv(surface, out / f"points_{k:03d}.csv", columns)
+    surface_files.write_surface_vtk(surface, out / f"surface_{k:03d}.vtk", columns)
     std = 1e3 * np.linalg.norm(surface.std, axis=1)
-    write_field_picture(surface, grey, std, out / f"std_{k:03d}.png", title="std deviation", unit="mm")
+    surface_files.write_field_picture(surface, grey, std, out / f"std_{k:03d}.png", title="std deviation", unit="mm")
     if reference is not None:
         file = out / f"displacement_{k:03d}.png"
         length = 1e3 * np.linalg.norm(surface.x_world - reference.x_world, axis=1)
-        write_field_picture(surface, grey, length, file, title="displacement", unit="mm")
+        surface_files.write_field_picture(surface, grey, length, file, title="displacement", unit="mm")
     if strain is not None:
         for name in ("xx", "yy", "xy"):
             file = out / f"strain_{name}_{k:03d}.png"
             title = f"strain {name}, {1e3 * strain.gauge:.1f} mm"
-            write_field_picture(surface, grey, 1e6 * getattr(strain, name), file, title=title, unit="1e-6")
+            values = 1e6 * getattr(strain, name)
+            surface_files.write_field_picture(surface, grey, values, file, title=title, unit="1e-6")
     return lines
 
 
@@ -400,7 +391,7 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
                 lines.append(f"stopped: {error}")
                 break
             if k in (0, count // 2, count - 1):
-                write_point_picture(points.uv[:, 0], images[0].grey, wanted.out / f"points_{k:06d}.png")
+                surface_files.write_point_picture(points.uv[:, 0], images[0].grey, wanted.out / f"points_{k:06d}.png")
             middle = images if k == min(count // 2, max(count - 2, 0)) else middle
             progress("frames", k + 1, count)
     paths = tracker.trajectories()
@@ -411,15 +402,15 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
             paths, radius=_surroundings(paths), bounds=wanted.bounds, neighbours=wanted.neighbours,
             uniformity=wanted.bright is None,
         )  # fmt: skip
-    write_paths_csv(kept, wanted.out / "trajectories.csv")
+    surface_files.write_paths_csv(kept, wanted.out / "trajectories.csv")
     if kept.live.any():
         for view, (name, image) in enumerate(zip(views.names, middle)):
-            write_paths_picture(kept, view, image.grey, wanted.out / f"paths_{name}.png")
+            surface_files.write_paths_picture(kept, view, image.grey, wanted.out / f"paths_{name}.png")
         at = min(count // 2, count - 2)
         if 0 < at < len(kept.times) - 1:
-            write_velocity_picture(kept, at, middle[0].grey, wanted.out / "velocity.png")
+            surface_files.write_velocity_picture(kept, at, middle[0].grey, wanted.out / "velocity.png")
     if motion is not None:
-        write_returns_csv(tracker.returns(), motion.rate, wanted.out / "returns.csv")
+        surface_files.write_returns_csv(tracker.returns(), motion.rate, wanted.out / "returns.csv")
     live, before = kept.live.sum(axis=1), int(paths.live.any(axis=0).sum())
     lengths = kept.live.sum(axis=0)
     lengths = lengths[lengths > 0] if lengths.any() else np.zeros(1, int)

@@ -68,19 +68,11 @@ def surface(
     With --flat there is no calibration: all arguments are photographs, before and after, or there is one video. With
     --motion one camera is enough: its points lie on the body.
     """
-    from kinefit.cli.surfaces._measure import (
-        PHOTOGRAPHS,
-        Wanted,
-        flat_video,
-        measure_one_camera,
-        measure_photographs,
-        measure_videos,
-        read_views,
-    )
+    from kinefit.cli.surfaces import _measure
     from kinefit.errors import ObservationError
 
     _screen.check_folder(out)
-    wanted = Wanted(
+    wanted = _measure.Wanted(
         out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth, motion, bounds, neighbours,
         bright, reach,
     )  # fmt: skip
@@ -94,21 +86,24 @@ def surface(
     for name, value in textured.items():
         if value is not None and bright is not None:
             raise ObservationError(f"{name} needs texture, --bright has none", remedy="Leave out one of them.")
-    one_video = flat is not None and not views and calibration.suffix.lower() not in PHOTOGRAPHS
+    one_video = flat is not None and not views and calibration.suffix.lower() not in _measure.PHOTOGRAPHS
     if one_video and (motion or seeds) is not None:
         raise ObservationError("--motion and --seeds need a calibration", remedy="Leave them out, or leave out --flat.")
     if of_videos and flat is not None and not one_video:
         raise ObservationError(f"{of_videos[0]} needs videos; --flat has photographs", remedy="Leave out one of them.")
     if flat is not None and not one_video:
-        lines = measure_one_camera([calibration, *map(Path, views)], flat, wanted)
+        lines = _measure.measure_one_camera([calibration, *map(Path, views)], flat, wanted)
     else:
-        fewest = 1 if motion is not None else 2
-        rig, paths = flat_video(calibration, flat or 0.0) if one_video else read_views(calibration, unit, views, fewest)
+        if one_video:
+            rig, paths = _measure.flat_video(calibration, flat or 0.0)
+        else:
+            rig, paths = _measure.read_views(calibration, unit, views, 1 if motion is not None else 2)
         if of_videos and not paths.videos:
             problem = f"{of_videos[0]} needs videos; the views are photographs"
             raise ObservationError(problem, remedy="Leave it out, or give videos.")
         with _screen.bars() as progress:
-            lines = (measure_videos if paths.videos else measure_photographs)(rig, paths, wanted, progress)
+            measure = _measure.measure_videos if paths.videos else _measure.measure_photographs
+            lines = measure(rig, paths, wanted, progress)
     for line in lines:
         _screen.say(line)
     _screen.say(f"\nWritten: {out}")

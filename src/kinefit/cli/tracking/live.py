@@ -68,6 +68,7 @@ def live(
     """
     from kinefit.readers.take.file import read_take
     from kinefit.simulation.recordings import warm_depth, warm_keypoints
+    from kinefit.studio.live.receivers import websocket
     from kinefit.studio.live.record import MotionRecord
     from kinefit.studio.live.take import folder_of, live_session
 
@@ -78,25 +79,14 @@ def live(
     session: LiveSession = live_session(entry, speed=speed, folder=folder, tell=_screen.note)
     try:
         rate, up = session.tracker.rate, entry.up
-        if lines is not None:
-            from kinefit.studio.live.receivers.websocket import JsonLines
-
-            receivers.append(JsonLines(lines))
-        if vmc is not None:
-            from kinefit.studio.live.receivers.websocket import Vmc
-
-            receivers.append(Vmc(*vmc, up=up))
-        if lsl is not None:
-            from kinefit.studio.live.receivers.websocket import Lsl
-
-            receivers.append(Lsl(lsl, rate=rate))
+        receivers += [] if lines is None else [websocket.JsonLines(lines)]
+        receivers += [] if vmc is None else [websocket.Vmc(*vmc, up=up)]
+        receivers += [] if lsl is None else [websocket.Lsl(lsl, rate=rate)]
         kept = None if folder is None else MotionRecord(folder, rate=rate, up=up, name=entry.name)
         if kept is not None:
             receivers.append(kept)
         if page:  # the last: its thread, once it has a pose, takes its turns with whoever is still to get it
-            from kinefit.studio.live.receivers.websocket import WebSockets
-
-            served = WebSockets(port, host=host, token=token, title=entry.name, ask=session.ask)
+            served = websocket.WebSockets(port, host=host, token=token, title=entry.name, ask=session.ask)
             receivers.append(served)
             if served.access.warning:
                 _screen.note(f"warning: {served.access.warning}")

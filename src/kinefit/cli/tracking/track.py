@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from kinefit.cli import _screen
+from kinefit.errors import AssetError, KinefitError, TrackingError, command
 from kinefit.takes.batch.results import DEFAULT_FORMATS, FORMATS
 
 if TYPE_CHECKING:
@@ -161,7 +162,6 @@ def run(
     `results` is filled with a record of each person, for --json.
     """
     results = [] if results is None else results
-    from kinefit.errors import KinefitError
     from kinefit.takes.batch.one import asked_take, check_drawable, of_motion, people_of
     from kinefit.takes.batch.summary import Row, failed, write_people_report
 
@@ -199,7 +199,6 @@ def _track_one(
 ) -> tuple[int, TrackedPerson]:  # fmt: skip
     """Track one person of a take, write and print the results; returns the exit code and the tracked person."""
     from kinefit.cli._summary import as_record, print_files, print_summary
-    from kinefit.errors import TrackingError
     from kinefit.findings import of_provenance
     from kinefit.takes.batch.one import track_person
 
@@ -264,7 +263,6 @@ def demo(ctx: click.Context, out: Path, synthetic: bool) -> None:
     The recording (51 MB) is downloaded once, through pip, and kept. If the download fails, a simulated figure is
     tracked instead.
     """
-    from kinefit.errors import command
     from kinefit.takes.batch.one import Choices
 
     _screen.check_folder(out)
@@ -283,7 +281,6 @@ def demo(ctx: click.Context, out: Path, synthetic: bool) -> None:
 
 def sample_take(folder: Path) -> Path:
     """Write the sample recording as a take, with its credit shown; the drawn figure where it cannot be had."""
-    from kinefit.errors import AssetError
     from kinefit.readers.assets import SAMPLE_CREDIT, write_sample_take
 
     try:

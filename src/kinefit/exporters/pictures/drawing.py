@@ -13,17 +13,7 @@ from kinefit.bodies import Body, PointSet
 from kinefit.bodies.limbs import finger_groups
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.motion import OUTLIER_WEIGHT, Motion, Residuals
-from kinefit.bodies.rendering import Canvas
-from kinefit.bodies.rendering.looks import (
-    LOST_COLOUR,
-    TubeMesh,
-    body_mesh,
-    segment_looks,
-    side_colour,
-    side_colours,
-    triangle_segments,
-    uncertain_segments,
-)
+from kinefit.bodies.rendering import Canvas, looks
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.geometry.camera import Camera, ImageFrame
 
@@ -56,7 +46,7 @@ def bones(body: Body) -> tuple[PointSet, tuple[int, ...], tuple[tuple[int, int, 
         for tip, side in tips:
             owners.append(s)
             points += [np.zeros(3), tip]
-            colours.append(side_colour(side))
+            colours.append(looks.side_colour(side))
             widths.append(_FINGER_WIDTH if side in fingers else _LIMB_WIDTH)
     names = tuple(f"{tree.segments[s]}_{k}" for s in owners for k in (0, 1))
     return PointSet(names, np.repeat(owners, 2), np.array(points)), tuple(owners), tuple(colours), np.array(widths)
@@ -77,16 +67,16 @@ def draw_bones(image: NDArray, motion: Motion, frame: int, camera: Camera, image
         width = max(1, int(thick[b]) // 3) if lost else int(thick[b])
         dash = _DASH_WIDTHS * (width + 2 * edge) if lost else 0.0
         draw_line(image, uv[b], DARK, width + 2 * edge, dash)
-        draw_line(image, uv[b], LOST_COLOUR if lost else colours[b], width, dash)
+        draw_line(image, uv[b], looks.LOST_COLOUR if lost else colours[b], width, dash)
     for b in np.flatnonzero(~motion.lost[frame, list(owners)]):
         draw_dot(image, uv[b, 0], 0.36 * thick[b], WHITE, -1)
 
 
 @lru_cache(maxsize=8)
-def _skin(body: Body) -> tuple[TubeMesh, NDArray]:
+def _skin(body: Body) -> tuple[looks.TubeMesh, NDArray]:
     """The skin as viewer and report show it, and the segment of each triangle."""
-    mesh = body_mesh(body)
-    return mesh, triangle_segments(mesh)
+    mesh = looks.body_mesh(body)
+    return mesh, looks.triangle_segments(mesh)
 
 
 def draw_skin(image: NDArray, motion: Motion, frame: int, camera: Camera, image_frame: ImageFrame) -> None:
@@ -100,9 +90,9 @@ def draw_skin(image: NDArray, motion: Motion, frame: int, camera: Camera, image_
     vertices = np.einsum("vij,vj->vi", followed[..., :3], mesh.vertices) + followed[..., 3]
     normals = np.einsum("vij,vj->vi", followed[..., :3], mesh.normals)[mesh.triangles].mean(axis=1)
     light = 0.5 + 0.6 * np.maximum(normals @ (camera.T_camera_world[:3, :3].T @ _TO_LIGHT), 0.0)
-    colours, opacities = segment_looks(
-        motion.segment_quality[frame], side_colours(motion.body), by_quality=False,
-        uncertain=uncertain_segments(motion.body, motion.joint_std[frame]),
+    colours, opacities = looks.segment_looks(
+        motion.segment_quality[frame], looks.side_colours(motion.body), by_quality=False,
+        uncertain=looks.uncertain_segments(motion.body, motion.joint_std[frame]),
     )  # fmt: skip
     shades = np.column_stack([np.minimum(colours[owners] * light[:, None], 255.0), np.full(len(owners), 255.0)])
     shades *= _SKIN_OPACITY * opacities[owners][:, None]
@@ -137,7 +127,7 @@ def draw_body(image: NDArray, motion: Motion, frame: int, camera: Camera, image_
             uv = image_frame.from_calibration(contour)
             dash = _DASH_WIDTHS * 3 * edge if lost[s] else 0.0
             draw_line(image, uv, DARK, 3 * edge, dash)
-            draw_line(image, uv, LOST_COLOUR if lost[s] else side_colour(segments[s]), edge, dash)
+            draw_line(image, uv, looks.LOST_COLOUR if lost[s] else looks.side_colour(segments[s]), edge, dash)
 
 
 def segment_contours(segments: NDArray, segment: int) -> list[NDArray]:

@@ -22,15 +22,7 @@ from kinefit.bodies.motion import Motion, Residuals
 from kinefit.bodies.rendering import render_body, scaled
 from kinefit.bodies.rendering.looks import LOST_COLOUR
 from kinefit.errors import ExportError
-from kinefit.exporters.pictures.drawing import (
-    WHITE,
-    draw_body,
-    draw_line,
-    draw_residuals,
-    draw_skin,
-    segment_contours,
-    write_lines,
-)
+from kinefit.exporters.pictures import drawing
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.observations import DepthVideo
 from kinefit.readers.videos.video import Video
@@ -155,17 +147,17 @@ def draw_overlay(
     residuals = motion.residuals.get(camera.name) if residuals is None else residuals
     if residuals is not None and (residuals.unit != "px" or not residuals.of_points):
         residuals = None
-    lines = [(f"{camera.name}   {label or f'frame {frame}'}", WHITE)]
+    lines = [(f"{camera.name}   {label or f'frame {frame}'}", drawing.WHITE)]
     if frame is None:
-        write_lines(out, [*lines, ("no motion here", _NOTE)])
+        drawing.write_lines(out, [*lines, ("no motion here", _NOTE)])
         return out
     if skin:
-        draw_skin(out, motion, frame, camera, image_frame)
-    draw_body(out, motion, frame, camera, image_frame)
+        drawing.draw_skin(out, motion, frame, camera, image_frame)
+    drawing.draw_body(out, motion, frame, camera, image_frame)
     if residuals is not None:
-        draw_residuals(out, residuals, frame, image_frame)
-        lines.append((_told(residuals, frame), WHITE))
-    write_lines(out, lines + [(note, _NOTE) for note in _notes(motion, residuals, frame)])
+        drawing.draw_residuals(out, residuals, frame, image_frame)
+        lines.append((_told(residuals, frame), drawing.WHITE))
+    drawing.write_lines(out, lines + [(note, _NOTE) for note in _notes(motion, residuals, frame)])
     return out
 
 
@@ -288,12 +280,12 @@ def depth_picture(
     if raster is not None and frame is not None:
         part, lost = raster.segment, np.append(motion.lost[frame], False)  # -1, the background, is not lost
         for a, b, there in ((part[1:], part[:-1], out[1:]), (part[:, 1:], part[:, :-1], out[:, 1:])):
-            there[(a != b) & ~lost[a] & ~lost[b]] = WHITE
+            there[(a != b) & ~lost[a] & ~lost[b]] = drawing.WHITE
         for s in np.flatnonzero(lost).tolist():
-            for rim in segment_contours(part, s):
-                draw_line(out, rim, LOST_COLOUR, 1, _DASH_PX)
+            for rim in drawing.segment_contours(part, s):
+                drawing.draw_line(out, rim, LOST_COLOUR, 1, _DASH_PX)
     if label:
-        write_lines(out, [(label, WHITE)])
+        drawing.write_lines(out, [(label, drawing.WHITE)])
     return out
 
 

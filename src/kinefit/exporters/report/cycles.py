@@ -85,13 +85,11 @@ def find_cycles(motion: Motion) -> Cycles | None:
 
 def normalised(values: NDArray, spans: NDArray) -> NDArray:
     """Curves (N, 101, ...) over 0..100 % of the spans (N, 2) of values (F, ...), linear between frames."""
-    out = np.empty((len(spans), len(PERCENT), *values.shape[1:]))
-    for k, (start, stop) in enumerate(spans):
-        at = start + PERCENT / 100 * (stop - start)
-        low = np.minimum(at.astype(int), len(values) - 2)
-        share = (at - low).reshape(-1, *(1,) * (values.ndim - 1))
-        out[k] = values[low] * (1 - share) + values[low + 1] * share
-    return out
+    start, stop = spans[:, :1], spans[:, 1:]
+    at = start + PERCENT / 100 * (stop - start)
+    low = np.minimum(at.astype(int), len(values) - 2)
+    share = (at - low).reshape(*at.shape, *(1,) * (values.ndim - 1))
+    return values[low] * (1 - share) + values[low + 1] * share
 
 
 def likeness(curves: NDArray) -> float:

@@ -10,17 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, MeshSurface, PointSet
 from kinefit.bodies.motion import Motion, rotation_between_up
-from kinefit.bodies.rendering.looks import (
-    LOST_COLOUR,
-    LOST_OPACITY,
-    UNCERTAIN_OPACITY,
-    body_mesh,
-    is_last,
-    side_colour,
-    to_hex,
-    triangle_segments,
-    uncertain_segments,
-)
+from kinefit.bodies.rendering import looks
 from kinefit.bodies.surfaces import Surface
 from kinefit.exporters.pictures.drawing import bones
 from kinefit.exporters.report.page import Html, to_json
@@ -49,10 +39,10 @@ def figure(motion: Motion, rig: Rig | None = None) -> Html:
     T = se3.transform(R, np.zeros(3))
     Ts = motion.body.tree.segment_poses(T @ motion.Ts_world_root[frames], motion.angles[frames])
     cameras = [] if rig is None else [_pyramid(camera.name, camera, R) for camera in rig]
-    looks = {"lost": motion.lost[frames], "uncertain": uncertain_segments(motion.body, motion.joint_std[frames])}
+    hints = {"lost": motion.lost[frames], "uncertain": looks.uncertain_segments(motion.body, motion.joint_std[frames])}
     return _player(
         motion.body, Ts, rate=motion.rate / step, start=float(motion.times[0]), cameras=cameras,
-        **{look: _packed(np.packbits(segments)) if segments.any() else "" for look, segments in looks.items()},
+        **{look: _packed(np.packbits(segments)) if segments.any() else "" for look, segments in hints.items()},
     )  # fmt: skip
 
 
@@ -78,9 +68,10 @@ def _player(body: Body, Ts: NDArray, **more: Any) -> Html:
         "frames": len(Ts), "segments": len(names), "poses": _packed(poses), "quantum": quantum,
         "middle": 0.5 * (low + high), "low": low, "high": high, "floor": floor, "rest": body.tree.rest,
         "ends": capsules.points.points, "owners": owners, "radii": capsules.radii, "skin": _skin(body),
-        "colours": [to_hex(side_colour(name)) for name in names],
-        "sides": [name.endswith("_r") - name.endswith("_l") for name in names], "lost_colour": to_hex(LOST_COLOUR),
-        "opacities": [LOST_OPACITY, UNCERTAIN_OPACITY], "cameras": [], "start": 0.0, "lost": "", "uncertain": "",
+        "colours": [looks.to_hex(looks.side_colour(name)) for name in names],
+        "sides": [name.endswith("_r") - name.endswith("_l") for name in names],
+        "lost_colour": looks.to_hex(looks.LOST_COLOUR), "opacities": [looks.LOST_OPACITY, looks.UNCERTAIN_OPACITY],
+        "cameras": [], "start": 0.0, "lost": "", "uncertain": "",
         **more,
     }  # fmt: skip
     return Html(f'<div class="player" id="figure"><script type="application/json">{to_json(data)}</script></div>')
@@ -88,9 +79,9 @@ def _player(body: Body, Ts: NDArray, **more: Any) -> Html:
 
 def _skin(body: Body) -> dict[str, Any] | None:
     """The skin as `player.js` reads it, each vertex once for every segment that it shows; None without one."""
-    mesh = body_mesh(body)
+    mesh = looks.body_mesh(body)
     V = len(mesh.vertices)
-    pairs, faces = np.unique(triangle_segments(mesh)[:, None] * V + mesh.triangles, return_inverse=True)
+    pairs, faces = np.unique(looks.triangle_segments(mesh)[:, None] * V + mesh.triangles, return_inverse=True)
     if not 0 < len(pairs) <= _MAX_VERTICES or len(body.tree.segments) > _MAX_SEGMENTS:
         return None
     shown, used = np.divmod(pairs, V)
@@ -131,7 +122,7 @@ def _limbs(c: Surface, body: Body) -> list[tuple[int, NDArray, NDArray]]:
         return [(c.segment, middle + np.outer([-1, 1], max(half[0] - radius, 1e-3) * axes[0]), np.full(2, radius))]
     start, end, radii = np.array(c.start), np.array(c.end), np.array(c.radii)
     thin, wide = np.argmin(radii.sum(0)), np.argmax(radii.sum(0))
-    if is_last(body, c):
+    if looks.is_last(body, c):
         end = start + (end - start) * max(0.2, 1 - c.mean_radii[1] / c.length)
     if c.is_round:
         return [(c.segment, np.stack([start, end]), radii[:, 0])]

@@ -9,14 +9,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.motion import Motion, Residuals
 from kinefit.exporters.pictures.drawing import draw_body, draw_residuals, drawn_points
+from kinefit.exporters.report import moments as doubt
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.moments import (
-    Moment,
-    doubtful_moments,
-    place,
-    span,
-    spoken_segments,
-)
 from kinefit.geometry.camera import Camera, ImageFrame
 
 Pictures = Mapping[str, Mapping[int, NDArray[np.uint8]]]
@@ -30,7 +24,7 @@ _WARNING, _BAD = "#e0a100", "#d0441c"
 
 
 def flagged(
-    motion: Motion, moments: Sequence[Moment], throughout: str, pictures: Pictures, width: int
+    motion: Motion, moments: Sequence[doubt.Moment], throughout: str, pictures: Pictures, width: int
 ) -> list[p.Html]:
     """Parts of the section on doubtful moments, with `throughout_sentence`; pictures at most `width` px wide."""
     if not motion.residuals and not moments:
@@ -57,11 +51,11 @@ def flagged(
     return out
 
 
-def time_line(motion: Motion, moments: Sequence[Moment]) -> p.Html:
+def time_line(motion: Motion, moments: Sequence[doubt.Moment]) -> p.Html:
     """When what is doubtful: one row for each part of the body, the worst first; a click moves the 3D figure there."""
-    rows: dict[str, list[Moment]] = {}
+    rows: dict[str, list[doubt.Moment]] = {}
     for m in moments:
-        rows.setdefault(spoken_segments(motion.body, m.segments), []).append(m)
+        rows.setdefault(doubt.spoken_segments(motion.body, m.segments), []).append(m)
     shown = list(rows)[:_MAX_TIMELINE_ROWS]
     traces = []
     for name in reversed(shown):  # plots grow upwards
@@ -81,8 +75,8 @@ def time_line(motion: Motion, moments: Sequence[Moment]) -> p.Html:
     return p.plot(traces, layout, height=height, label="when which part of the body is doubtful", seeks=True)
 
 
-def _when(motion: Motion, m: Moment) -> p.Html:
-    return p.joined(p.moment(motion.times[m.worst], span(motion, m)), f" {place(motion, m)}")
+def _when(motion: Motion, m: doubt.Moment) -> p.Html:
+    return p.joined(p.moment(motion.times[m.worst], doubt.span(motion, m)), f" {doubt.place(motion, m)}")
 
 
 def report_frames(motion: Motion) -> dict[int, str]:
@@ -91,7 +85,7 @@ def report_frames(motion: Motion) -> dict[int, str]:
         return {}
     out: dict[int, str] = {0: "first", len(motion) // 2: "middle", len(motion) - 1: "last"}
     out.setdefault(int(np.argmin(motion.quality)), "lowest quality")
-    for m in doubtful_moments(motion)[:MOMENTS]:
+    for m in doubt.doubtful_moments(motion)[:MOMENTS]:
         out.setdefault(m.worst, "doubtful")
     return out
 

@@ -230,6 +230,15 @@ def code(text: str) -> Html:
     return Html(f"<pre>{escape(text)}</pre>")
 
 
+def scaled(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
+    """An image (H, W, 3) whose longer side has at most `longest` [px]."""
+    share = longest / max(image.shape[:2])
+    if share >= 1.0:
+        return image
+    size = max(1, round(share * image.shape[1])), max(1, round(share * image.shape[0]))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def picture(
     image: NDArray[np.uint8], *, caption: str = "", width: int = 900, quality: int = 80, lossless: bool = False
 ) -> Html:
@@ -243,10 +252,7 @@ def picture(
     array = np.asarray(image)
     if array.ndim != 3 or array.shape[2] != 3 or array.dtype != np.uint8 or 0 in array.shape:
         raise ExportError(f"an image of shape {array.shape}, {array.dtype}", remedy="Give (H, W, 3) uint8 RGB.")
-    shrink = min(1.0, width / max(array.shape[:2]))
-    size = (max(1, round(array.shape[1] * shrink)), max(1, round(array.shape[0] * shrink)))
-    if shrink < 1:
-        array = cv2.resize(array, size, interpolation=cv2.INTER_AREA)
+    array = scaled(array, width)
     kind, options = ("png", []) if lossless else ("jpeg", [cv2.IMWRITE_JPEG_QUALITY, quality])
     encoded, data = cv2.imencode(f".{kind}", cv2.cvtColor(array, cv2.COLOR_RGB2BGR), options)
     if not encoded:
@@ -254,8 +260,8 @@ def picture(
     text = base64.b64encode(data.tobytes()).decode("ascii")
     caption_tag = f"<figcaption>{inline(caption)}</figcaption>" if caption else ""
     return Html(
-        f'<figure><img alt="{escape(re.sub("<[^>]*>", "", caption))}" width="{size[0]}" height="{size[1]}" '
-        f'src="data:image/{kind};base64,{text}">{caption_tag}</figure>'
+        f'<figure><img alt="{escape(re.sub("<[^>]*>", "", caption))}" width="{array.shape[1]}" '
+        f'height="{array.shape[0]}" src="data:image/{kind};base64,{text}">{caption_tag}</figure>'
     )
 
 

@@ -20,32 +20,14 @@ from kinefit._arguments import checked
 from kinefit._files import write_text
 from kinefit.bodies.motion import Motion
 from kinefit.errors import ExportError, choices
+from kinefit.exporters.report import angles
+from kinefit.exporters.report import moments as doubt
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.angles import (
-    AngleRange,
-    all_ranges,
-    cycle_plots,
-    joint_plots,
-    ranges_table,
-    short_table,
-    with_error,
-)
 from kinefit.exporters.report.cycles import Cycles, Norms, find_cycles, gait_numbers
 from kinefit.exporters.report.figure import figure
 from kinefit.exporters.report.fit import overall_median, point_table, quality_plot, sensor_fits, sensor_table
 from kinefit.exporters.report.flagged import Pictures, flagged, report_frames
 from kinefit.exporters.report.methods import lengths_table, methods
-from kinefit.exporters.report.moments import (
-    POORLY_SUPPORTED,
-    Moment,
-    doubt_sentence,
-    doubtful_moments,
-    never_observed,
-    shared_by_prior,
-    spoken_segments,
-    throughout_sentence,
-    unmarked,
-)
 from kinefit.exporters.report.strides import Quantity
 from kinefit.exporters.tables import curves, spoken
 from kinefit.findings import listed, of_provenance
@@ -107,7 +89,7 @@ def write_report(
     if not len(motion):
         raise ExportError("a motion without frames has nothing to report", file=path, remedy="Track the take first.")
     date = date or datetime.date.today().isoformat()
-    moments, throughout, shown = doubtful_moments(motion), throughout_sentence(motion), pictures or {}
+    moments, throughout, shown = doubt.doubtful_moments(motion), doubt.throughout_sentence(motion), pictures or {}
     cycles = find_cycles(motion)
     check_norms(motion, norms, path)
     width = round(640 * min(1.0, (_BUDGET / max(1, sum(map(len, shown.values())))) ** 0.5))
@@ -135,7 +117,7 @@ def write_report(
     return Path(path)
 
 
-def trust_sentence(motion: Motion, moments: Sequence[Moment]) -> str:
+def trust_sentence(motion: Motion, moments: Sequence[doubt.Moment]) -> str:
     """One sentence on how far the motion can be trusted."""
     parts = []
     for unit, shown_unit in (("px", "px"), ("m", "mm")):
@@ -145,7 +127,7 @@ def trust_sentence(motion: Motion, moments: Sequence[Moment]) -> str:
     start = " and ".join(parts) or "has no measurements to compare it with"
     if not moments:
         return f"The motion {start}; no doubtful moment."
-    return f"The motion {start}; doubtful moments: {doubt_sentence(motion, moments)}."
+    return f"The motion {start}; doubtful moments: {doubt.doubt_sentence(motion, moments)}."
 
 
 def _subtitle(motion: Motion, date: str) -> str:
@@ -153,10 +135,10 @@ def _subtitle(motion: Motion, date: str) -> str:
 
 
 def _summary(
-    motion: Motion, moments: Sequence[Moment], throughout: str, findings: Sequence[tuple[str, str, str]], date: str
+    motion: Motion, moments: Sequence[doubt.Moment], throughout: str, findings: Sequence[tuple[str, ...]], date: str
 ) -> p.Section:
     """Results, their confidence and what to do, in five lines and one table of ranges."""
-    found, session = all_ranges(motion), motion.provenance.get("session")
+    found, session = angles.all_ranges(motion), motion.provenance.get("session")
     sure = [one for one in found if one.is_sure]
     severity, trust = _trust(motion, moments, throughout)
     facts = {}
@@ -189,16 +171,16 @@ def _summary(
         "Summary", *([p.facts(facts)] if facts else []),
         p.callout(severity, "In short", *(p.paragraph(p.strong(f"{name}: "), text) for name, text in lines.items())),
         *(p.callout(*finding) for finding in findings),
-        *([short_table(sure)] if sure else []),
+        *([angles.short_table(sure)] if sure else []),
         *([f"Moved less than their error bars: {listed(least, 60)}."] if least else []), p.paragraph(about, small=True),
-        p.folded("Lowest, highest, fastest of every angle", ranges_table(motion), p.paragraph(more, small=True)),
+        p.folded("Lowest, highest, fastest of every angle", angles.ranges_table(motion), p.paragraph(more, small=True)),
         p.folded("Lengths of the body", lengths_table(motion)),
     )  # fmt: skip
 
 
-def _trust(motion: Motion, moments: Sequence[Moment], throughout: str) -> tuple[str, str]:
+def _trust(motion: Motion, moments: Sequence[doubt.Moment], throughout: str) -> tuple[str, str]:
     """How far the motion can be trusted: severity of a box, and the sentence."""
-    poor = float(np.mean(motion.quality < POORLY_SUPPORTED * (1.0 - unmarked(motion).mean(axis=1))))
+    poor = float(np.mean(motion.quality < doubt.POORLY_SUPPORTED * (1.0 - doubt.unmarked(motion).mean(axis=1))))
     unobserved = float(np.mean(motion.quality <= 0))
     wrong = unobserved > 0.1 or poor > 0.5 or of_provenance(motion.provenance)
     severity = "bad" if wrong else "warning" if moments or throughout else "good"
@@ -212,16 +194,16 @@ def _trust(motion: Motion, moments: Sequence[Moment], throughout: str) -> tuple[
     return severity if motion.residuals else "note", p.joined(*parts)
 
 
-def _moved_most(sure: Sequence[AngleRange]) -> str:
+def _moved_most(sure: Sequence[angles.AngleRange]) -> str:
     """The three largest ranges of those that are twice their error bars."""
     each = [(span, f"{side} {one.name}".strip(), twice) for one in sure for side, (span, twice) in one.sides.items()]
     most = sorted((one for one in each if one[0] > 2.0 * one[2]), reverse=True)[:3]
     if not most:
         return "no angle moved by twice its error bar."
-    return listed([f"{name} ({with_error(span, twice)}°)" for span, name, twice in most]) + "."
+    return listed([f"{name} ({angles.with_error(span, twice)}°)" for span, name, twice in most]) + "."
 
 
-def _sides(found: Sequence[AngleRange]) -> str:
+def _sides(found: Sequence[angles.AngleRange]) -> str:
     """Ranges of left and right that differ by more than the error bar."""
     differ = [(one.name, one.difference) for one in found if one.difference is not None]
     apart = [(name, pair) for name, pair in differ if abs(pair[0]) > pair[1]]
@@ -230,10 +212,10 @@ def _sides(found: Sequence[AngleRange]) -> str:
     if not apart:
         least = min(twice for _, (_, twice) in differ)
         return f"no range differs by more than its error bar; the least difference that would count is {least:.0f}°."
-    return "ranges differ in " + listed([f"{name} ({with_error(*pair)}°)" for name, pair in apart], 6) + "."
+    return "ranges differ in " + listed([f"{name} ({angles.with_error(*pair)}°)" for name, pair in apart], 6) + "."
 
 
-def _what_to_do(motion: Motion, moments: Sequence[Moment]) -> str:
+def _what_to_do(motion: Motion, moments: Sequence[doubt.Moment]) -> str:
     """The first remedy."""
     faults = [fault.remedy for fault in of_provenance(motion.provenance) if fault.remedy]
     if faults:
@@ -260,18 +242,18 @@ def _limits(motion: Motion, throughout: str) -> list[p.Html]:
         parts.append(p.callout("warning", f"Constant shift in {shifts}.", text))
     if throughout:
         parts.append(p.callout("note", f"Uncertain in most frames, at the far end (2 σ): {throughout}."))
-    bare = np.flatnonzero(2 * unmarked(motion).sum(axis=0) > len(motion))
+    bare = np.flatnonzero(2 * doubt.unmarked(motion).sum(axis=0) > len(motion))
     text = "No measurement observes them. Their values come from the prior and are no results."
     if len(bare):
-        names = spoken_segments(motion.body, [motion.body.tree.segments[s] for s in bare], 20)
+        names = doubt.spoken_segments(motion.body, [motion.body.tree.segments[s] for s in bare], 20)
         parts.append(p.callout("note", f"Not observed, as they have no markers: {names}.", text))
     angles_of_bare = {motion.body.tree.coordinates[d] for d in np.flatnonzero(np.isin(motion.body.tree.owners, bare))}
-    blind = [name for name in never_observed(motion) if name not in angles_of_bare]
+    blind = [name for name in doubt.never_observed(motion) if name not in angles_of_bare]
     if blind:
         most = len(blind) > 0.5 * len(motion.body.dof_names)
         title = f"Not observed: {listed([spoken(name) for name in blind], 8)}."
         parts.append(p.callout("bad" if most else "note", title, text))
-    shared = shared_by_prior(motion)
+    shared = doubt.shared_by_prior(motion)
     if shared:
         each = [f"{spoken(name)} (±{2 * std:.0f}°)" for name, std in shared.items()]
         title = f"Shares from the reference pose: {listed(each, 8)}."
@@ -291,7 +273,7 @@ def _angles(motion: Motion) -> list[p.Html]:
             "Names and signs are those of OpenSim's Rajagopal model. The band is ±2 standard deviations of the "
             "measurement; a grey dashed line without a band was not observed in that time."
         ),
-        p.chooser("Joint", joint_plots(motion)),
+        p.chooser("Joint", angles.joint_plots(motion)),
     ]
 
 
@@ -327,7 +309,7 @@ def _cycles(motion: Motion, cycles: Cycles | None, norms: Norms) -> list[p.Html]
     parts = [p.paragraph(text), gait_table(motion, cycles)]
     if norms:
         parts.append(p.paragraph("The grey band is the normative mean ±1 standard deviation of the table given."))
-    return [*parts, p.chooser("Joint", cycle_plots([(motion, cycles)], norms))]
+    return [*parts, p.chooser("Joint", angles.cycle_plots([(motion, cycles)], norms))]
 
 
 def gait_table(motion: Motion, cycles: Cycles) -> p.Html:
@@ -359,7 +341,7 @@ def _digits(value: float, count: int = 3) -> int:
     return min(6, max(0, count - 1 - int(np.floor(np.log10(max(abs(value), 1e-9))))))
 
 
-def _fit(motion: Motion, moments: Sequence[Moment]) -> list[p.Html]:
+def _fit(motion: Motion, moments: Sequence[doubt.Moment]) -> list[p.Html]:
     text = "Quality is the share of the body that its measurements support: less than half below the dotted line."
     parts = [p.paragraph(text), quality_plot(motion, moments)]
     if not motion.residuals:

@@ -16,19 +16,7 @@ from kinefit._files import write_lines
 from kinefit.bodies import Body
 from kinefit.bodies.motion import Motion
 from kinefit.errors import ExportError
-from kinefit.exporters.skeletons.common import (
-    UNITS,
-    Rest,
-    bone_names,
-    check_up,
-    euler_zxy,
-    length_factor,
-    moving_segments,
-    numbers,
-    plain_names,
-    rest_pose,
-    standing,
-)
+from kinefit.exporters.skeletons import common
 
 _ROTATIONS = "Zrotation Xrotation Yrotation"
 _POSITIONS = "Xposition Yposition Zposition"
@@ -63,10 +51,11 @@ def write_bvh(
     ExportError
         Unknown unit, axis, names or rest pose, or the file cannot be written.
     """
-    body, scale, joints = motion.body, length_factor(unit, UNITS, path), bone_names(motion.body, names, path)
-    pose = rest_pose(body, rest, names, path)
-    check_up(up, path)
-    with_position = moving_segments(body)
+    body, scale = motion.body, common.length_factor(unit, common.UNITS, path)
+    joints = common.bone_names(body, names, path)
+    pose = common.rest_pose(body, rest, names, path)
+    common.check_up(up, path)
+    with_position = common.moving_segments(body)
     order: list[int] = []
     head = ["HIERARCHY", *_hierarchy(body, pose, joints, with_position, scale, order)]
 
@@ -74,7 +63,7 @@ def write_bvh(
         before = None
         for part in motion.parts():
             Ts = pose.local_poses(part.turned(up))
-            turns = euler_zxy(Ts[..., :3, :3], before)
+            turns = common.euler_zxy(Ts[..., :3, :3], before)
             before = turns[-1] if len(turns) else None
             columns: list[NDArray] = []
             for s in order:
@@ -93,7 +82,7 @@ def bvh_motion(motion: Motion, tables: Iterable[NDArray]) -> Iterator[str]:
 
 
 def _hierarchy(
-    body: Body, pose: Rest, names: list[str], with_position: NDArray, scale: float, order: list[int]
+    body: Body, pose: common.Rest, names: list[str], with_position: NDArray, scale: float, order: list[int]
 ) -> list[str]:
     """Lines of the hierarchy; fills `order` with the segments in the order of their channels."""
     tree = body.tree
@@ -104,12 +93,12 @@ def _hierarchy(
         indent, inner = "\t" * depth, "\t" * (depth + 1)
         channels = f"6 {_POSITIONS} {_ROTATIONS}" if with_position[s] else f"3 {_ROTATIONS}"
         lines = [f"{indent}{'JOINT' if depth else 'ROOT'} {names[s]}", f"{indent}{{"]
-        lines += [f"{inner}OFFSET {numbers(scale * pose.offsets[s], '.8f')}", f"{inner}CHANNELS {channels}"]
+        lines += [f"{inner}OFFSET {common.numbers(scale * pose.offsets[s], '.8f')}", f"{inner}CHANNELS {channels}"]
         children = np.flatnonzero(tree.parents == s)
         for child in children:
             lines += joint(int(child), depth + 1)
         if not len(children):
-            end = numbers(ends.get(s, np.zeros(3)), ".8f")
+            end = common.numbers(ends.get(s, np.zeros(3)), ".8f")
             lines += [f"{inner}End Site", f"{inner}{{", f"{inner}\tOFFSET {end}", f"{inner}}}"]
         return [*lines, f"{indent}}}"]
 
@@ -149,13 +138,13 @@ def write_x3d(motion: Motion, path: str | PathLike[str], *, names: str | None = 
     if len(motion) < 2:
         raise ExportError("X3D moves a figure between two frames or more", file=path, remedy="Give a longer motion.")
     names = names or ("hanim" if body.aliases.get("hanim") else "kinefit")
-    joints, segments = bone_names(body, names, path), plain_names(body.tree.segments)
+    joints, segments = common.bone_names(body, names, path), common.plain_names(body.tree.segments)
     ids = _ids(joints, segments)
-    plain = rest_pose(body, rest, names, path)
-    pose = standing(body) if np.array_equal(plain.turns, np.broadcast_to(np.eye(3), plain.turns.shape)) else plain
+    plain = common.rest_pose(body, rest, names, path)
+    pose = common.standing(body) if np.all(plain.turns == np.eye(3)) else plain
     turns, places = pose.local_moves(motion, "y")
-    moves = moving_segments(body)
-    keys = numbers(np.arange(len(motion)) / (len(motion) - 1), _FORM)
+    moves = common.moving_segments(body)
+    keys = common.numbers(np.arange(len(motion)) / (len(motion) - 1), _FORM)
 
     def lines() -> Iterator[str]:
         seconds = (len(motion) - 1) / motion.rate
@@ -192,14 +181,14 @@ def _ids(joints: Sequence[str], segments: Sequence[str]) -> list[tuple[str, str]
 
 
 def _joints(
-    body: Body, pose: Rest, names: Sequence[str], plain: Sequence[str], ids: Sequence[tuple[str, str]]
+    body: Body, pose: common.Rest, names: Sequence[str], plain: Sequence[str], ids: Sequence[tuple[str, str]]
 ) -> Iterator[str]:
     """The tree of joints, each with its segment: lines to the joints below, or to its end."""
     tree, ends = body.tree, body.segment_ends()
 
     def joint(s: int) -> Iterator[str]:
         field = ' containerField="skeleton"' if tree.parents[s] < 0 else ""
-        centre = numbers(pose.positions[s], _FORM)
+        centre = common.numbers(pose.positions[s], _FORM)
         yield f'<HAnimJoint{field} DEF="{ids[s][0]}" name={quoteattr(names[s])} center="{centre}">'
         children = [int(child) for child in np.flatnonzero(tree.parents == s)]
         to = [pose.positions[child] for child in children]
@@ -207,7 +196,7 @@ def _joints(
             to = [pose.positions[s] + pose.turns[s] @ ends[s]]
         yield f'<HAnimSegment DEF="{ids[s][1]}" name={quoteattr(plain[s])}>'
         if to:
-            points = numbers([[pose.positions[s], end] for end in to], _FORM)
+            points = common.numbers([[pose.positions[s], end] for end in to], _FORM)
             yield '<Shape><Appearance><Material emissiveColor="0.1 0.4 0.7"/></Appearance>'
             yield f'<LineSet vertexCount="{" ".join(["2"] * len(to))}"><Coordinate point="{points}"/></LineSet></Shape>'
         yield "</HAnimSegment>"
@@ -222,7 +211,7 @@ def _joints(
 def _moved(kind: str, field: str, joint: str, keys: str, values: NDArray) -> Iterator[str]:
     """An interpolator, and its routes from the clock and to the joint."""
     name = f"{field}_{joint}"
-    yield f'<{kind}Interpolator DEF="{name}" key="{keys}" keyValue="{numbers(values, _FORM)}"/>'
+    yield f'<{kind}Interpolator DEF="{name}" key="{keys}" keyValue="{common.numbers(values, _FORM)}"/>'
     yield f'<ROUTE fromNode="clock" fromField="fraction_changed" toNode="{name}" toField="set_fraction"/>'
     yield f'<ROUTE fromNode="{name}" fromField="value_changed" toNode="{joint}" toField="set_{field}"/>'
 

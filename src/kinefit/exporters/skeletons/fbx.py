@@ -21,20 +21,7 @@ from kinefit._files import writing
 from kinefit.bodies import Body
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.rendering.looks import TubeMesh, body_mesh
-from kinefit.exporters.skeletons.common import (
-    UNITS,
-    Rest,
-    bone_names,
-    check_frames,
-    euler,
-    length_factor,
-    linear_colours,
-    moving_segments,
-    plain_names,
-    rest_pose,
-    turned,
-    turning_segments,
-)
+from kinefit.exporters.skeletons import common
 
 TICKS_PER_S = 46_186_158_000
 """Unit of time of FBX, KTime, in a second."""
@@ -82,17 +69,18 @@ def write_fbx(
     ExportError
         A motion without frames, unknown unit, axis, names or rest pose, or the file cannot be written.
     """
-    check_frames(motion, path)
-    body, factor, world = motion.body, length_factor(unit, UNITS, path), turned(motion, up, path, _UPS)
-    joints, pose = bone_names(body, names, path), rest_pose(body, rest, names, path)
+    common.check_frames(motion, path)
+    body, factor = motion.body, common.length_factor(unit, common.UNITS, path)
+    world = common.turned(motion, up, path, _UPS)
+    joints, pose = common.bone_names(body, names, path), common.rest_pose(body, rest, names, path)
     mesh = pose.posed(body_mesh(body, cylinders=cylinders), body)
     pose, mesh = _on_the_ground(pose, mesh)
     scene = _Scene(*pose.matrices(up, factor), factor)
     bones = _add_bones(scene, body, joints)
-    figure = plain_names([*joints, body.name])[-1]
+    figure = common.plain_names([*joints, body.name])[-1]
     _add_bind_pose(scene, bones, _add_skin(scene, figure, mesh, dict(zip(joints, bones))))
     ticks = np.rint((world.times - world.times[0]) * TICKS_PER_S).astype(np.int64)
-    clip = plain_names([motion.name])[0]
+    clip = common.plain_names([motion.name])[0]
     _add_animation(scene, clip, world, pose, bones, ticks)
     records = [*_head(), _settings(motion.rate, ticks, up, factor), *scene.records(clip, ticks)]
     with writing(path) as temporary, temporary.open("wb") as file:
@@ -208,7 +196,7 @@ def _settings(rate: float, ticks: NDArray, up: str, factor: float) -> Record:
     mode = _TIME_MODES.get(round(rate), _TIME_MODE_CUSTOM) if rate == round(rate) else _TIME_MODE_CUSTOM
     return record("GlobalSettings", inside=[record("Version", 1000), _table(
         *(_integer(name, value) for name, value in axes),
-        ("UnitScaleFactor", "double", "Number", "", UNITS["cm"] / factor), ("TimeMode", "enum", "", "", mode),
+        ("UnitScaleFactor", "double", "Number", "", common.UNITS["cm"] / factor), ("TimeMode", "enum", "", "", mode),
         _time("TimeSpanStart", ticks[0]), _time("TimeSpanStop", ticks[-1]),
         ("CustomFrameRate", "double", "Number", "", float(rate)),
     )])  # fmt: skip
@@ -258,7 +246,7 @@ class _Scene:
         yield record("Takes", inside=[record("Current", clip), take])
 
 
-def _on_the_ground(pose: Rest, mesh: TubeMesh) -> tuple[Rest, TubeMesh]:
+def _on_the_ground(pose: common.Rest, mesh: TubeMesh) -> tuple[common.Rest, TubeMesh]:
     """The rest pose and the mesh in it, raised until the lowest point is at 0.
 
     Programs that transfer a motion divide by the height of the hips at rest, which would be 0.
@@ -278,7 +266,7 @@ def _model(*placed: tuple[Any, ...]) -> tuple[Record, ...]:
 
 def _add_bones(scene: _Scene, body: Body, names: list[str]) -> list[np.int64]:
     """Add a bone for each segment, at rest; their numbers."""
-    angles = np.degrees(euler(scene.local[None, :, :3, :3], "zyx"))[0, :, ::-1]
+    angles = np.degrees(common.euler(scene.local[None, :, :3, :3], "zyx"))[0, :, ::-1]
     bones = list[np.int64]()
     for s, name in enumerate(names):
         shown = scene.add("NodeAttribute", name, "NodeAttribute", "LimbNode", record("TypeFlags", "Skeleton"))
@@ -314,7 +302,7 @@ def _add_skin(scene: _Scene, name: str, mesh: TubeMesh, bones: Mapping[str, np.i
     skin = scene.add("Deformer", "skin", "Deformer", "Skin", record("Version", 101), record("Link_DeformAcuracy", 50.0))
     for child, parent in ((model, np.int64(0)), (shape, model), (skin, shape)):
         scene.join(child, parent)
-    for colour, linear in zip(colours, linear_colours(colours).tolist()):
+    for colour, linear in zip(colours, common.linear_colours(colours).tolist()):
         look = scene.add(
             "Material", f"skin_{colour.tobytes().hex()}", "Material", "", record("Version", 102),
             record("ShadingModel", "lambert"), _table(("DiffuseColor", "Color", "", "A", *linear)),
@@ -356,7 +344,7 @@ def _add_bind_pose(scene: _Scene, bones: list[np.int64], meshes: list[np.int64])
 
 
 def _add_animation(
-    scene: _Scene, clip: str, motion: Motion, pose: Rest, bones: list[np.int64], ticks: NDArray
+    scene: _Scene, clip: str, motion: Motion, pose: common.Rest, bones: list[np.int64], ticks: NDArray
 ) -> None:
     """Add keys of every frame: the root turns and moves, other joints as they can."""
     span = [(f"{of}{end}", at) for of in ("Local", "Reference") for end, at in zip(("Start", "Stop"), ticks[[0, -1]])]
@@ -365,7 +353,7 @@ def _add_animation(
     scene.join(layer, stack)
     angles, places = _local_courses(motion, pose, scene.factor)
     times = _Encoded(_encoded(ticks))
-    turning, moving = turning_segments(motion.body), moving_segments(motion.body)
+    turning, moving = common.turning_segments(motion.body), common.moving_segments(motion.body)
     for s, bone in enumerate(bones):
         for letter, name, values in (("R", "Lcl Rotation", angles), ("T", "Lcl Translation", places)):
             if (turning if letter == "R" else moving)[s]:
@@ -378,12 +366,12 @@ def _add_animation(
                     scene.join(_add_curve(scene, times, start, values[:, s, a]), node, axis)
 
 
-def _local_courses(motion: Motion, pose: Rest, factor: float) -> tuple[NDArray, NDArray]:
+def _local_courses(motion: Motion, pose: common.Rest, factor: float) -> tuple[NDArray, NDArray]:
     """Angles (F, S, 3) [deg] about x, y, z, of which x turns first, and places (F, S, 3) of bones in their parents."""
     turns, places = list[NDArray](), list[NDArray]()
     for part in motion.parts():
         Ts = pose.local_poses(part)
-        turns.append(euler(Ts[..., :3, :3], "zyx", turns[-1][-1] if turns else None))
+        turns.append(common.euler(Ts[..., :3, :3], "zyx", turns[-1][-1] if turns else None))
         places.append(factor * Ts[..., :3, 3])
     return np.degrees(np.concatenate(turns))[..., ::-1], np.concatenate(places)
 

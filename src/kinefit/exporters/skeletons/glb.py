@@ -20,19 +20,7 @@ from kinefit.bodies.motion import Motion
 from kinefit.bodies.rendering.looks import TubeMesh, body_mesh
 from kinefit.bodies.surfaces import Surface
 from kinefit.errors import ExportError, extra
-from kinefit.exporters.skeletons.common import (
-    UNITS,
-    Rest,
-    bone_names,
-    check_frames,
-    length_factor,
-    linear_colours,
-    moving_segments,
-    plain_names,
-    rest_pose,
-    turned,
-    turning_segments,
-)
+from kinefit.exporters.skeletons import common
 
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _COMPONENTS = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}
@@ -66,9 +54,9 @@ def write_glb(
     ExportError
         A motion without frames, unknown names or rest pose, or the file cannot be written.
     """
-    check_frames(motion, path)
+    common.check_frames(motion, path)
     body, tree = motion.body, motion.body.tree
-    joints, pose = bone_names(body, names, path), rest_pose(body, rest, names, path)
+    joints, pose = common.bone_names(body, names, path), common.rest_pose(body, rest, names, path)
     nodes: list[dict[str, Any]] = []
     for s, name in enumerate(joints):
         nodes.append({"name": name, "translation": pose.offsets[s].tolist()})
@@ -80,9 +68,9 @@ def write_glb(
     })  # fmt: skip
     if body.surfaces or body.skin is not None:
         _add_skin(file, pose.posed(body_mesh(body, cylinders=cylinders), body), pose)
-        nodes.append({"name": plain_names([body.name])[0], "mesh": 0, "skin": 0})
+        nodes.append({"name": common.plain_names([body.name])[0], "mesh": 0, "skin": 0})
         scene["nodes"] = [0, len(joints)]
-    file.animate(plain_names([motion.name])[0], motion.times, _courses(motion, pose))
+    file.animate(common.plain_names([motion.name])[0], motion.times, _courses(motion, pose))
     write_bytes(path, file.packed())
 
 
@@ -129,7 +117,7 @@ class GltfFile:
         return head + text + struct.pack("<I4s", len(self.data), b"BIN\0") + bytes(self.data)
 
 
-def _add_skin(file: GltfFile, mesh: TubeMesh, pose: Rest) -> None:
+def _add_skin(file: GltfFile, mesh: TubeMesh, pose: common.Rest) -> None:
     weights = mesh.weights.astype(np.float32)
     segments = np.where(weights > 0, mesh.segments, 0).astype(np.uint16)
     colours = np.pad(mesh.colours, ((0, 0), (0, 1)), constant_values=255)
@@ -152,8 +140,8 @@ def _add_skin(file: GltfFile, mesh: TubeMesh, pose: Rest) -> None:
     }
 
 
-def _courses(motion: Motion, pose: Rest) -> Iterator[tuple[int, str, NDArray]]:
-    moving, turning = moving_segments(motion.body), turning_segments(motion.body)
+def _courses(motion: Motion, pose: common.Rest) -> Iterator[tuple[int, str, NDArray]]:
+    moving, turning = common.moving_segments(motion.body), common.turning_segments(motion.body)
     turns, places = pose.local_moves(motion, "y")
     for s in range(len(moving)):
         if turning[s]:
@@ -200,10 +188,10 @@ def write_usd(
         from pxr import Tf, Usd
     if Path(path).suffix not in ENDINGS:
         raise ExportError("not a name of a USD file", file=path, remedy=f"Let it end in one of {', '.join(ENDINGS)}.")
-    check_frames(motion, path)
-    factor, world = length_factor(unit, UNITS, path), turned(motion, up, path, _UPS)
-    joints = joint_paths(motion.body, bone_names(motion.body, names, path))
-    pose = rest_pose(motion.body, rest, names, path)
+    common.check_frames(motion, path)
+    factor, world = common.length_factor(unit, common.UNITS, path), common.turned(motion, up, path, _UPS)
+    joints = joint_paths(motion.body, common.bone_names(motion.body, names, path))
+    pose = common.rest_pose(motion.body, rest, names, path)
     with writing(path) as temporary:
         try:
             stage = Usd.Stage.CreateInMemory()
@@ -229,7 +217,7 @@ def joint_paths(body: Body, names: list[str]) -> list[str]:
     return out
 
 
-def _fill(stage: Any, motion: Motion, pose: Rest, joints: list[str], factor: float, cylinders: bool) -> None:
+def _fill(stage: Any, motion: Motion, pose: common.Rest, joints: list[str], factor: float, cylinders: bool) -> None:
     from pxr import Gf, Usd, UsdGeom, UsdSkel
 
     UsdGeom.SetStageUpAxis(stage, motion.up.upper())
@@ -266,7 +254,7 @@ def _reach(surface: Surface) -> float:
     return max(float(np.linalg.norm(end)) + max(r) for end, r in zip((surface.start, surface.end), surface.radii))
 
 
-def _animation(stage: Any, motion: Motion, pose: Rest, joints: list[str], factor: float) -> Any:
+def _animation(stage: Any, motion: Motion, pose: common.Rest, joints: list[str], factor: float) -> Any:
     from pxr import Gf, Usd, UsdSkel, Vt
 
     animation = UsdSkel.Animation.Define(stage, "/Figure/Skeleton/Animation")
@@ -297,7 +285,7 @@ def _mesh(stage: Any, content: TubeMesh, T_skeleton_root: NDArray, factor: float
     colour = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
         "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex
     )
-    colour.Set(Vt.Vec3fArray.FromNumpy(np.float32(linear_colours(content.colours))))
+    colour.Set(Vt.Vec3fArray.FromNumpy(np.float32(common.linear_colours(content.colours))))
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
     binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
     followed, shares = np.int32(content.segments.ravel()), np.float32(content.weights.ravel())

@@ -14,17 +14,8 @@ from kinefit._files import parse_toml
 from kinefit.errors import CalibrationError, located
 from kinefit.geometry.camera import Camera
 from kinefit.geometry.se3 import exp_so3, inverse, rotation_from_quaternion, transform
+from kinefit.readers.calibration import keys
 from kinefit.readers.calibration.file_storage import storage_of_xml, storage_of_yaml
-from kinefit.readers.calibration.keys import (
-    Table,
-    conventions,
-    find,
-    find_all,
-    kind_of,
-    lens_model,
-    refuse_unread,
-    spelled,
-)
 
 Sizes = tuple[int, int] | Callable[[str], tuple[int, int] | None]
 """(width, height) [px] of all images, or a function of the camera's name, None where it knows none."""
@@ -40,7 +31,7 @@ _MAX_QUATERNION_ERROR = 0.05  # of its length from 1: rounding to two decimals m
 _PARSERS: dict[str, Callable[[str], Any]] = {"json": json.loads, "yaml": storage_of_yaml, "xml": storage_of_xml}
 
 
-def read_table(text: str, kind: str) -> Table:
+def read_table(text: str, kind: str) -> keys.Table:
     """Parse "toml", "json", "yaml" or "xml" (the last two: OpenCV FileStorage); raises CalibrationError if broken."""
     try:
         if kind == "toml":
@@ -60,7 +51,7 @@ def _matrices(value: Any) -> Any:
     return [_matrices(inner) for inner in value] if isinstance(value, list) else value
 
 
-def _matrix(table: Table) -> Any:
+def _matrix(table: keys.Table) -> Any:
     """Nested lists of a stored OpenCV matrix (OpenCV 5 writes vectors with `sizes`); other tables unchanged."""
     of_ros = {"rows", "cols"} <= table.keys() and isinstance(table.get("data"), list)  # without dt
     if not (of_ros or {"dt", "data"} <= table.keys()):
@@ -69,7 +60,7 @@ def _matrix(table: Table) -> Any:
     return np.array(table["data"], dtype=float).reshape([int(n) for n in np.ravel(shape).tolist()]).tolist()
 
 
-def camera_from_table(name: str, table: Table, *, image_size: Sizes | None, pose_needed: bool | None) -> Camera:
+def camera_from_table(name: str, table: keys.Table, *, image_size: Sizes | None, pose_needed: bool | None) -> Camera:
     """Camera of one table; translation in the file's unit. `pose_needed`: None where nothing is asked of its pose.
 
     With a transposed matrix, [[fx, 0, 0], [s, fy, 0], [cx, cy, 1]], points are rows, as in MATLAB before R2022b and in
@@ -82,10 +73,10 @@ def camera_from_table(name: str, table: Table, *, image_size: Sizes | None, pose
         the lens, the pose or a convention and that kinefit does not read.
     """
     with located(None, f"camera {name}"):
-        model = lens_model(table)
-        K = numbers(find(table, "matrix"), None, "camera matrix")
+        model = keys.lens_model(table)
+        K = numbers(keys.find(table, "matrix"), None, "camera matrix")
         if K.shape == (4,):
-            skew = numbers(find(table, "skew") or 0.0, (), "skew")
+            skew = numbers(keys.find(table, "skew") or 0.0, (), "skew")
             K = np.array([[K[0], skew, K[2]], [0, K[1], K[3]], [0, 0, 1]])
         K = numbers(K, (3, 3), "camera matrix")
         of_rows = is_transposed(K)
@@ -98,22 +89,22 @@ def camera_from_table(name: str, table: Table, *, image_size: Sizes | None, pose
         with located(None, "distortion"):
             k = _distortion(table, model)
         T = _pose(table, of_rows, pose_needed)
-        refuse_unread(table, has_lens=k is not None, has_pose=T is not None or pose_needed is None)
+        keys.refuse_unread(table, has_lens=k is not None, has_pose=T is not None or pose_needed is None)
     lens = np.zeros(0) if k is None else k
     return Camera(name, size, K.T if of_rows else K, lens, model, np.eye(4) if T is None else T)
 
 
-def _distortion(table: Table, model: str) -> NDArray | None:
+def _distortion(table: keys.Table, model: str) -> NDArray | None:
     """Coefficients (k,) of the model in OpenCV's order; None if the table has none."""
-    radial, tangential = (numbers(find(table, kind) or []).ravel() for kind in _PARTS_OF_LENS)
-    scalars = {spelled(key): value for key, value in table.items() if kind_of(str(key)) == "coefficient"}
+    radial, tangential = (numbers(keys.find(table, kind) or []).ravel() for kind in _PARTS_OF_LENS)
+    scalars = {keys.spelled(key): value for key, value in table.items() if keys.kind_of(str(key)) == "coefficient"}
     scalars = {key: value for key, value in scalars.items() if not isinstance(value, list | dict)}  # P1: a matrix
     names = _COEFFICIENTS if model == "radtan" else ("k1", "k2", "k3", "k4")
     odd = [key for key in scalars if scalars[key] and (key not in names or (key == "k4" and "k5" not in scalars))]
     if odd and (model == "radtan" or odd != ["k4"]):
         remedy = 'Write model = "fisheye" if it is (k1 k2 k3 k4 alone), else calibrate with k1, k2, p1, p2, k3.'
         raise CalibrationError(f"{', '.join(odd)} of a lens whose model is not OpenCV's", remedy=remedy)
-    given = [numbers(value).ravel() for value in find_all(table, "distortion")]
+    given = [numbers(value).ravel() for value in keys.find_all(table, "distortion")]
     if radial.size:
         first, second = (np.pad(part, (0, max(0, 2 - part.size))) for part in (radial, tangential))
         ordered = [first[:2], second, first[2:]] if model == "radtan" else [radial, tangential]
@@ -133,26 +124,26 @@ def is_transposed(K: ArrayLike) -> bool:
     return bool(K[2, :2].any()) and not K[:2, 2].any()
 
 
-def _pose(table: Table, of_rows: bool, pose_needed: bool | None) -> NDArray | None:
+def _pose(table: keys.Table, of_rows: bool, pose_needed: bool | None) -> NDArray | None:
     """(4, 4) T_camera_world of a table, in the file's unit; None if it has none and needs none."""
-    said = conventions(table)
+    said = keys.conventions(table)
     T = _as_written(table, of_rows)
     if T is None:
-        rotation, translation = (find(table, kind) is None for kind in ("rotation", "translation"))
+        rotation, translation = (keys.find(table, kind) is None for kind in ("rotation", "translation"))
         if rotation and translation and not pose_needed:
             return None
         missing = " and ".join(["rotation"] * rotation + ["translation"] * translation)
         remedy = "Calibrate the extrinsics too: every camera's pose."
         raise CalibrationError(f"{missing} missing", remedy=remedy)
-    if "c2w" in said and find(table, "inverse pose") is None:
+    if "c2w" in said and keys.find(table, "inverse pose") is None:
         T = inverse(T)
     return transform(_OPENGL_AXES, np.zeros(3)) @ T if "opengl" in said else T
 
 
-def _as_written(table: Table, of_rows: bool) -> NDArray | None:
+def _as_written(table: keys.Table, of_rows: bool) -> NDArray | None:
     """(4, 4) transform of a table from world to camera, as its keys' names have it; None if it has none."""
     for kind in ("pose", "inverse pose"):
-        pose = find(table, kind)
+        pose = keys.find(table, kind)
         matrix = numbers([] if pose is None else pose, None, "pose")
         if pose is None or (matrix.ndim == 2 and matrix.shape[1] == 6):  # OpenCV's views of the board
             continue
@@ -162,7 +153,7 @@ def _as_written(table: Table, of_rows: bool) -> NDArray | None:
             raise CalibrationError(problem, remedy="Give (4, 4), a point being a column.")
         T = rigid(matrix[:3, :3], matrix[:3, 3])
         return T if kind == "pose" else inverse(T)
-    rotation, translation = find(table, "rotation"), find(table, "translation")
+    rotation, translation = keys.find(table, "rotation"), keys.find(table, "translation")
     if rotation is None or translation is None:
         return None
     R = numbers(rotation, None, "rotation").squeeze()
@@ -217,13 +208,13 @@ def rotation_of(quaternion: NDArray) -> NDArray:
     return rotation_from_quaternion(quaternion)
 
 
-def _size(table: Table) -> tuple[int, int] | None:
-    size, width, height = find(table, "size"), find(table, "width"), find(table, "height")
-    shape = find(table, "shape")
+def _size(table: keys.Table) -> tuple[int, int] | None:
+    size, width, height = keys.find(table, "size"), keys.find(table, "width"), keys.find(table, "height")
+    shape = keys.find(table, "shape")
     if size is None and isinstance(shape, list) and len(shape) > 1:
         height, width = shape[:2]
     if isinstance(size, dict):
-        width, height, size = find(size, "width"), find(size, "height"), None
+        width, height, size = keys.find(size, "width"), keys.find(size, "height"), None
     if size is None and (width is None or height is None):
         return None
     array = numbers(size if size is not None else (width, height), (2,), "image size")

@@ -19,15 +19,10 @@ from kinefit._files import regular
 from kinefit.errors import CalibrationError, ExportError, KinefitError, check_choice, located
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import inverse, log_so3
+from kinefit.readers.calibration import read
 from kinefit.readers.calibration.colmap import colmap_texts
 from kinefit.readers.calibration.keys import find, find_all
 from kinefit.readers.calibration.mocap import qualisys_text
-from kinefit.readers.calibration.read import (
-    calibration_sources,
-    metres_per_unit,
-    read_calibration,
-    recognise,
-)
 from kinefit.readers.calibration.tables import is_transposed, read_table
 from kinefit.readers.calibration.trees import tables_of
 from kinefit.readers.ros.recordings import inside
@@ -79,7 +74,7 @@ def write_calibration_like(
     if inside(like) is not None:
         remedy = "Use `read_calibration` and `write_calibration` to make a TOML of it, and name that in the take."
         raise CalibrationError("kinefit cannot write cameras into a recording of ROS 2", file=like, remedy=remedy)
-    old = read_calibration(like, unit=unit, image_size=image_size, exteriors=False)
+    old = read.read_calibration(like, unit=unit, image_size=image_size, exteriors=False)
     for name in rig.names:
         check_choice("camera", name, old.names, CalibrationError, file=like, remedy="Give the rig these names.")
     _check_target(like, path, overwrite)
@@ -120,7 +115,7 @@ def _move(root: Path, path: Path, texts: dict[str, str]) -> None:
 def _compare(rig: Rig, written: Path, like: Path, **reading: Any) -> None:
     """Read the written calibration back; raise CalibrationError for what the format did not represent."""
     try:
-        back = read_calibration(written, exteriors=False, **reading)
+        back = read.read_calibration(written, exteriors=False, **reading)
     except KinefitError as error:
         raise CalibrationError(
             f"the file cannot hold the rig's numbers ({error.problem})", file=like, place=error.place, remedy=_REMEDY
@@ -149,19 +144,19 @@ def _padded(camera: Camera) -> NDArray:
 def _texts(rig: Rig, like: Path, unit: str | float) -> tuple[dict[str, str], Rig]:
     """Text of each file by its path below `like` ("" for the file itself), and the rig in the format's frame."""
     if like.is_dir() and ((like / "cameras.txt").exists() or (like / "cameras.bin").exists()):
-        texts = colmap_texts(rig, like, metres_per_unit([], unit))
+        texts = colmap_texts(rig, like, read.metres_per_unit([], unit))
         points = like / "points3D.txt"  # COLMAP opens no model without
         if points.exists():
             texts["points3D.txt"] = regular(points).read_text(encoding="utf-8")
         return texts, rig
     texts = {}
-    for name, group in calibration_sources(like):
+    for name, group in read.calibration_sources(like):
         if odd := [file for file in group if file.suffix.lower() in (".mat", ".xcp")]:
             raise CalibrationError("files of MATLAB and Vicon are read, not written", file=odd[0], remedy=_REMEDY)
         files = {file: regular(file).read_bytes().decode("utf-8-sig") for file in group}
-        kinds = {file: recognise(text, file) for file, text in files.items()}
+        kinds = {file: read.recognise(text, file) for file, text in files.items()}
         if "qualisys" in kinds.values():
-            scale = metres_per_unit([{"unit": "mm"}], unit)
+            scale = read.metres_per_unit([{"unit": "mm"}], unit)
             files = {file: qualisys_text(rig, text, scale) for file, text in files.items()}
         else:
             rig = _replace_tables(rig, name, files, kinds, unit)
@@ -176,7 +171,7 @@ def _replace_tables(rig: Rig, name: str, files: dict[Path, str], kinds: dict[Pat
     tables = tables_of(merged, name, exteriors=False)
     if "M1" in merged and tables[0][0] in rig:
         rig = rig.moved(rig[tables[0][0]].T_camera_world)
-    scale = metres_per_unit([table for _, table in tables], unit)
+    scale = read.metres_per_unit([table for _, table in tables], unit)
     places = {at: (file, *spot) for file, tree in trees.items() for at, spot in _places(tree, kinds[file]).items()}
     edits: dict[Path, list[tuple[int, int, str]]] = {file: [] for file in files}
     roots = {file: _xml_root(files[file]) for file in files if kinds[file] == "xml"}

@@ -17,16 +17,7 @@ from kinefit._files import read_text
 from kinefit.errors import FileError, ObservationError, names_file
 from kinefit.observations.clocks import counted_times, frames_by_name
 from kinefit.observations.videos import CloudVideo, DepthVideo
-from kinefit.readers.depth import clouds
-from kinefit.readers.depth.images import (
-    PICTURES,
-    DepthSource,
-    array_source,
-    listed,
-    npy_source,
-    picture_source,
-    raw_source,
-)
+from kinefit.readers.depth import clouds, images
 from kinefit.readers.depth.streams import bag_source, track_source
 from kinefit.readers.ros.images import mcap_source
 from kinefit.readers.ros.recordings import inside
@@ -148,11 +139,12 @@ def read_clouds(
         As `read_depth`.
     """
     path, unit = Path(path), _factor(unit)
-    files = _of_ending(listed(path), clouds.ENDINGS)
+    files = _of_ending(images.listed(path), clouds.ENDINGS)
     if not files:
         raise _nothing(f"clouds ({', '.join(clouds.ENDINGS)})")
     name = sensor or path.stem
-    source = DepthSource(len(files), lambda i: np.zeros((1, 1)), (1, 1), unit, names=tuple(f.name for f in files))
+    names = tuple(file.name for file in files)
+    source = images.DepthSource(len(files), lambda i: np.zeros((1, 1)), (1, 1), unit, names=names)
     times, rate, said = _times(source, rate, usual_rate, time_unit, time_offset, "clouds")
     first = clouds.read_cloud(files[0])
     T = np.array(first.T_file_sensor if T_world_sensor is None else T_world_sensor, float)
@@ -170,14 +162,14 @@ def read_clouds(
 
 def is_unordered(path: Path) -> bool:
     """Whether a path holds unorganised point clouds."""
-    files = _of_ending(listed(path), clouds.ENDINGS)
+    files = _of_ending(images.listed(path), clouds.ENDINGS)
     return bool(files) and clouds.read_cloud(files[0]).shape is None
 
 
-def _source(path: Path, name: str, size: tuple[int, int] | None, unit: float | None) -> DepthSource:
+def _source(path: Path, name: str, size: tuple[int, int] | None, unit: float | None) -> images.DepthSource:
     if (found := inside(path)) is not None:
         return mcap_source(found[0], name, found[1])
-    files = listed(path)
+    files = images.listed(path)
     if not files:
         if path.is_dir():
             raise _nothing("files")
@@ -185,24 +177,24 @@ def _source(path: Path, name: str, size: tuple[int, int] | None, unit: float | N
     if len(files) == 1:
         ending = files[0].suffix.lower()
         if ending == ".npz":
-            return array_source(files[0])
+            return images.array_source(files[0])
         if ending in (".mkv", ".avi", ".mov", ".mp4"):
             return track_source(files[0], name)
         if ending == ".bag":
             return bag_source(files[0], name)
-    if pictures := _of_ending(files, PICTURES):
-        return picture_source(pictures)
+    if pictures := _of_ending(files, images.PICTURES):
+        return images.picture_source(pictures)
     if pieces := _of_ending(files, clouds.ENDINGS):
         return _organised(pieces, name)
     if size is None and (colour := _of_ending(files, (".jpg", ".jpeg", ".bmp", ".gif"))):
         problem = f"{colour[0].suffix} files hold colour, not depth"
         raise FileError(problem, remedy=f"kinefit reads {FORMATS}.")
     if arrays := _of_ending(files, (".npy",)):
-        return npy_source(arrays)
-    return raw_source(files, size, unit)
+        return images.npy_source(arrays)
+    return images.raw_source(files, size, unit)
 
 
-def _unit_of_counts(path: Path, source: DepthSource) -> tuple[float, str]:
+def _unit_of_counts(path: Path, source: images.DepthSource) -> tuple[float, str]:
     """Unit [m] of 16-bit counts that no file states, and what is worth saying of it; millimetres without evidence.
 
     Lists of a TUM RGB-D folder beside the images state their convention. First Kinects keep three bits of each count
@@ -247,12 +239,12 @@ def _nothing(what: str) -> FileError:
     return FileError(f"it holds no {what}", remedy=f"kinefit reads {FORMATS}.")
 
 
-def _organised(files: list[Path], name: str) -> DepthSource:
+def _organised(files: list[Path], name: str) -> images.DepthSource:
     first = clouds.read_cloud(files[0])
     if first.shape is None:
         remedy = "Read it with kinefit.read_clouds; a take does so by itself."
         raise ObservationError("a cloud without the rows of an image", file=files[0], remedy=remedy)
-    return DepthSource(
+    return images.DepthSource(
         len(files), lambda i: _depth(files[i]), first.shape[::-1], 1.0,
         camera=clouds.camera_of(first, name), names=tuple(f.name for f in files),
     )  # fmt: skip
@@ -266,8 +258,8 @@ def _depth(file: Path) -> NDArray:
 
 
 def _times(
-    source: DepthSource, rate: float | None, default_rate: float | None, time_unit: float | None, time_offset: float,
-    what: str,
+    source: images.DepthSource, rate: float | None, default_rate: float | None, time_unit: float | None,
+    time_offset: float, what: str,
 ) -> tuple[NDArray, float, tuple[str, ...]]:  # fmt: skip
     """Times (F,) [s], rate [Hz], what is worth saying of them; the caller's values come before the file's."""
     times, said = source.times, ""

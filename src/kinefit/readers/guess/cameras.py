@@ -1,8 +1,13 @@
-"""Guess the cameras of a take: their videos and image frames, rate, unit of length and vertical axis."""
+"""Guess the cameras of a take: their videos and image frames, rate, unit of length and vertical axis.
+
+Nominal lenses of depth cameras, by the names of folders and the size of the image.
+"""
 
 from __future__ import annotations
 
+import re
 import struct
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,7 +24,7 @@ from kinefit.readers.guess.draft import Draft, Value
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile, KeypointFile
 from kinefit.readers.guess.names import HOW, Trial, trials
 from kinefit.readers.guess.views import keypoint_entries, keypoint_sources, read_sources
-from kinefit.readers.take.cameras import DEFAULT_FIELD_OF_VIEW
+from kinefit.readers.take.cameras import DEFAULT_FIELD_OF_VIEW, turned_frame
 from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.videos.video import Video, common_frames
 from kinefit.readers.videos.video_files import stated_time_code
@@ -253,7 +258,7 @@ def _pictures(
             entry[key] = draft.note_value(f"camera {name}", value, key)
         if relation:
             image = str(relation["image"].value) if "image" in relation else ""
-            images[name] = guess_views.image_frame(rig[name].size, video.size, _turn(relation), image)
+            images[name] = turned_frame(rig[name].size, video.size, _turn(relation), image)
     return images
 
 
@@ -377,3 +382,28 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
             return
         yield kind, data[at + 8 : at + size]
         at += size
+
+
+_LENSES = Path(__file__).with_name("depth_cameras.toml")
+
+
+def guessed_intrinsics(path: Path, size: tuple[int, int]) -> Value:
+    """[fx, fy, cx, cy] [px] of a depth image: by a name in the path and the size, by a size of one kind; else open.
+
+    Parameters
+    ----------
+    path : of the images, from the recording's folder on
+    size : (width, height) [px]
+    """
+    shape = f"{size[0]}x{size[1]}"
+    fitting = [one for one in tomllib.loads(_LENSES.read_text("utf-8"))["camera"] if shape in one["focal"]]
+    named = [one for one in fitting if re.search(one["words"], str(path), re.IGNORECASE)]
+    chosen = named or fitting
+    each = [f"{one['focal'][shape]:g} ({one['name']})" for one in chosen]
+    if not (named or len(chosen) == 1):
+        likely = f": fx = fy = {', '.join(each)}" if each else ""
+        return Value(None, "open", f"[fx, fy, cx, cy] in pixels of the depth image{likely}")
+    focal = chosen[0]["focal"][shape]
+    why = f"nominal, {each[0]}, by its {'name' if named else 'image size'}; the camera's own are better"
+    values = [focal, focal, (size[0] - 1) / 2.0, (size[1] - 1) / 2.0]
+    return Value(values, "likely" if named else "guess", why)

@@ -17,8 +17,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.observations.videos import DepthVideo
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.guess import files as guess_files
-from kinefit.readers.guess.cameras import describe_cameras, describe_uncalibrated
-from kinefit.readers.guess.depth_cameras import guessed_intrinsics
+from kinefit.readers.guess.cameras import describe_cameras, describe_uncalibrated, guessed_intrinsics
 from kinefit.readers.guess.draft import Draft, Entry, Note, Value
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile
 from kinefit.readers.guess.names import COUNTED, later_chapters, trials

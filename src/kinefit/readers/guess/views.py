@@ -20,6 +20,7 @@ from kinefit.readers.guess.names import Trial, camera_number, common_words, tria
 from kinefit.readers.landmarks.keypoint_sets import HAND_POINTS, OPENPOSE_HANDS, SET_OF_COUNT, SETS_WITH_HANDS
 from kinefit.readers.landmarks.keypoints import read_keypoints
 from kinefit.readers.plugins import KEYPOINTS
+from kinefit.readers.take.cameras import turned_frame
 from kinefit.readers.videos.video import Video
 
 Size = tuple[int, int]
@@ -59,7 +60,7 @@ def guess_turn(rig: Rig, records: Mapping[str, Keypoints], sizes: Mapping[str, S
     turned = [name for name, size in sizes.items() if is_turned(rig[name].size, size)]
     misses, seen = {}, [name for name in turned if name in records]
     for degrees in (90, 270) if seen and len(records) > 1 else ():
-        images = {n: image_frame(rig[n].size, sizes[n], degrees, "scaled") for n in seen}
+        images = {n: turned_frame(rig[n].size, sizes[n], degrees, "scaled") for n in seen}
         x, residual = meet(rig, records, images)
         found = np.isfinite(x).all(-1).sum()
         misses[degrees] = _median(residual) / found if found else np.inf
@@ -99,14 +100,6 @@ def picture(calibrated: Size, video: Video, turn: Value) -> dict[str, Value]:
     if max(expected) < 2:
         return out | {"image": Value("letterboxed", "likely", f"{sizes}: nearly the same shape")}
     return out | {"image": Value("scaled", "guess", f"{sizes}, without black bars; it may be cropped instead")}
-
-
-def image_frame(calibrated: Size, size: Size, degrees: int, image: str) -> ImageFrame:
-    """Image frame of a video that was rotated clockwise [deg], then "scaled" or "letterboxed" (or neither)."""
-    frame = ImageFrame.rotated(calibrated, degrees)
-    turned = calibrated if degrees % 180 == 0 else calibrated[::-1]
-    make = {"scaled": ImageFrame.scaled, "letterboxed": ImageFrame.letterboxed}.get(image)
-    return frame.then(make(turned, size)) if make else frame
 
 
 def black_bars(video: Video, frames: int = 5) -> tuple[int, int]:

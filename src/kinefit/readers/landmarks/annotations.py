@@ -82,8 +82,7 @@ def clicks_of(value: Any) -> Clicks:
             raise FileError("holds no points", place=f"camera {camera}", remedy=_FORM)
         points[camera] = {}
         for name, place in of.items():
-            pair = isinstance(place, list) and len(place) == 2 and all(type(v) in (int, float) for v in place)
-            if not pair or not all(abs(v) < _MAX_NUMBER for v in place):
+            if not _is_pixel(place):
                 raise FileError(f"{place!r} is not a pixel position", place=f"camera {camera}, {name}", remedy=_FORM)
             points[camera][name] = (float(place[0]), float(place[1]))
     return Clicks(step, points)
@@ -129,5 +128,5 @@ def read_static_points(
 def _is_pixel(value: object) -> bool:
     return (
         isinstance(value, list) and len(value) == 2
-        and all(isinstance(v, int | float) and not isinstance(v, bool) and -1e9 < v < 1e9 for v in value)
+        and all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < _MAX_NUMBER for v in value)
     )  # fmt: skip

@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.errors import FileError, check_choice, choices, located, names_file
 from kinefit.observations import SkeletonMotion
-from kinefit.readers.skeletons.common import (
-    euler_rotations,
-    given_unit,
-    joint_poses,
-    parse_numbers,
-    text_of,
-    vertical_axis,
-)
+from kinefit.readers.skeletons import common
 
 _INCH = 0.0254  # [m]
 _DOFS = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -94,9 +87,9 @@ def read_asf(path: str | PathLike[str], *, unit: float | str | None = None) -> A
     degrees = units.get("angle", (0, "deg"))[1].lower().startswith("deg")
     if unit is None or unit == "auto":
         line, length = units.get("length", (0, "1.0"))
-        (scale,) = parse_numbers([length], line)
+        (scale,) = common.parse_numbers([length], line)
         unit = _INCH / scale if scale > 0 else 0.0
-    unit = given_unit(unit)
+    unit = common.given_unit(unit)
 
     root = {words[0].lower(): (n, words[1:]) for n, words in sections["root"]}
     angle = np.pi / 180.0 if degrees else 1.0
@@ -119,7 +112,7 @@ def _sections(path: str | PathLike[str]) -> dict[str, list[tuple[int, list[str]]
     """Words of every line with its number, by section; comments dropped."""
     sections: dict[str, list[tuple[int, list[str]]]] = {}
     current: list[tuple[int, list[str]]] = []
-    for n, line in enumerate(text_of(path, "ASF").split("\n"), 1):
+    for n, line in enumerate(common.text_of(path, "ASF").split("\n"), 1):
         words = line.partition("#")[0].split()
         if words and words[0].startswith(":"):
             current = sections.setdefault(words[0][1:].lower(), [])
@@ -157,7 +150,7 @@ def _bone(entries: dict, line: int, unit: float, angle: float) -> Bone:
         raise FileError(f"the bone lacks {', '.join(missing)}", place=f"line {line}", remedy="Add it.")
     name = entries["name"][1][0]
     direction = np.array(_three(entries["direction"]))
-    (length,) = parse_numbers(entries["length"][1][:1], entries["length"][0])
+    (length,) = common.parse_numbers(entries["length"][1][:1], entries["length"][0])
     if length < 0 or not np.linalg.norm(direction) > 0:
         raise FileError(f"bone '{name}' has no direction or a negative length", place=f"line {line}", remedy="Set it.")
     axis_line, axis = entries.get("axis", (line, ["0", "0", "0", "XYZ"]))
@@ -183,7 +176,7 @@ def _bone(entries: dict, line: int, unit: float, angle: float) -> Bone:
 
 def _three(entry: tuple[int, Sequence[str]]) -> list[float]:
     line, words = entry
-    numbers = parse_numbers(words, line)
+    numbers = common.parse_numbers(words, line)
     if len(numbers) != 3:
         raise FileError(f"{len(numbers)} numbers instead of 3", place=f"line {line}", remedy="Give 3.")
     return numbers
@@ -194,7 +187,7 @@ def _axes(angles: NDArray, order: str, line: int) -> NDArray:
     order = order.lower()
     if sorted(order) != ["x", "y", "z"]:
         raise FileError(f"the order of axes '{order}' is unknown", place=f"line {line}", remedy="Give one, as XYZ.")
-    return euler_rotations(angles[::-1], order[::-1])
+    return common.euler_rotations(angles[::-1], order[::-1])
 
 
 def _check_dofs(dofs: Sequence[str], line: int) -> None:
@@ -288,9 +281,9 @@ def read_amc(
         if bone.dofs:
             _move(Ts_parent_joint[:, i], bone, values[bone.name], skeleton.unit, degrees)
     names = tuple(bone.name for bone in bones) + tuple(f"{bones[i].name}_end" for i in leaves)
-    Ts_world_joint = joint_poses(parents, Ts_parent_joint)
+    Ts_world_joint = common.joint_poses(parents, Ts_parent_joint)
     with located(amc_path):
-        up = vertical_axis(up, names, Ts_world_joint[..., :3, 3])
+        up = common.vertical_axis(up, names, Ts_world_joint[..., :3, 3])
     return SkeletonMotion(
         names=names,
         parents=np.array(parents),
@@ -306,7 +299,7 @@ def _move(Ts_parent_joint: NDArray, bone: Bone, values: NDArray, unit: float, de
     """Turn and shift one bone's rest pose (F, 4, 4) in place by its values (F, D): axes · M · axes⁻¹."""
     turns = [k for k, dof in enumerate(bone.dofs) if dof[0] == "r"][::-1]  # the first one listed acts first
     angles = np.radians(values[:, turns]) if degrees else values[:, turns]
-    R = euler_rotations(angles, [bone.dofs[k][1] for k in turns])
+    R = common.euler_rotations(angles, [bone.dofs[k][1] for k in turns])
     Ts_parent_joint[:, :3, :3] = bone.R_world_axes @ R @ bone.R_world_axes.T
     for k, dof in enumerate(bone.dofs):
         if dof[0] == "t":
@@ -331,7 +324,7 @@ def _read_values(path: str | PathLike[str], skeleton: AsfSkeleton) -> tuple[dict
             remedy = "If it is the last frame the file was cut off: export it again or delete that frame."
             raise fault(f"frame {first + frames - 1} lacks or repeats {', '.join(lacking)}", line, remedy)
 
-    for n, line in enumerate(text_of(path, "AMC").split("\n"), 1):
+    for n, line in enumerate(common.text_of(path, "AMC").split("\n"), 1):
         words = line.partition("#")[0].split()
         if not words:
             continue
@@ -351,7 +344,7 @@ def _read_values(path: str | PathLike[str], skeleton: AsfSkeleton) -> tuple[dict
             problem = f"{len(words) - 1} values for the {counts[words[0]]} degrees of freedom of '{words[0]}'"
             raise fault(problem, n, f"Give this motion's skeleton, not {skeleton.source}; or the file was cut off.")
         elif len(words) > 1:
-            values[words[0]].append(parse_numbers(words[1:], n))
+            values[words[0]].append(common.parse_numbers(words[1:], n))
     if not frames:
         raise fault("holds no frames", n, "Give an AMC file.")
     check_whole(n)

@@ -13,15 +13,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.errors import FileError, names_file
 from kinefit.observations import SkeletonMotion
-from kinefit.readers.skeletons.common import (
-    euler_rotations,
-    given_unit,
-    joint_poses,
-    landmarks,
-    parse_numbers,
-    text_of,
-    vertical_axis,
-)
+from kinefit.readers.skeletons import common
 
 UNITS = (0.001, 0.01, 0.0254, 0.0254 / 0.45, 1.0)
 """Metres per unit that "auto" chooses from: mm, cm, inch, the unit of CMU's ASF files, m."""
@@ -73,7 +65,7 @@ def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str =
     FileError
         Missing, truncated, not BVH, numbers that are not finite, or no unit with a plausible stature.
     """
-    text = text_of(path, "BVH")
+    text = common.text_of(path, "BVH")
     hierarchy, *motion = re.split(r"^[ \t]*MOTION\b", text, maxsplit=1, flags=re.M | re.I)
     joints = _read_hierarchy(hierarchy)
     if not motion:
@@ -86,9 +78,9 @@ def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str =
     Ts_parent_joint = _local_poses(joints, values)
     offsets = np.median(Ts_parent_joint[..., :3, 3], axis=0)
     offsets[0] = joints[0].offset
-    scale = _human_unit(names, parents, offsets) if unit == "auto" else given_unit(unit)
-    Ts_world_joint = joint_poses(parents, Ts_parent_joint)
-    up = vertical_axis(up, names, Ts_world_joint[..., :3, 3])
+    scale = _human_unit(names, parents, offsets) if unit == "auto" else common.given_unit(unit)
+    Ts_world_joint = common.joint_poses(parents, Ts_parent_joint)
+    up = common.vertical_axis(up, names, Ts_world_joint[..., :3, 3])
     Ts_world_joint[..., :3, 3] += _root_shift(joints[0], values, up)
     Ts_world_joint[..., :3, 3] *= scale
     return SkeletonMotion(
@@ -140,7 +132,7 @@ def _read_hierarchy(text: str) -> list[_BvhJoint]:
                     raise fault(f"the joint name '{name}' is missing or already used", line)
                 open_joints.append({"name": name, "parent": parent, "end": kind == "END", "index": None})
             case "OFFSET" if open_joints and open_joints[-1]["index"] is None:
-                offset = tuple(parse_numbers(take(3), line))
+                offset = tuple(common.parse_numbers(take(3), line))
                 open_joints[-1]["index"] = len(joints)
                 joints.append(_BvhJoint(open_joints[-1]["name"], open_joints[-1]["parent"], offset, ()))
             case "CHANNELS" if open_joints and open_joints[-1]["index"] is not None and not open_joints[-1]["end"]:
@@ -183,13 +175,13 @@ def _read_motion(text: str, channels: int, line: int) -> tuple[float, NDArray]:
             raise FileError(problem, place=f"line {lines[i][0] if i < len(lines) else line}", remedy=remedy)
         found.append(match[1])
     frames, rows = int(found[0]), lines[2:]
-    (frame_time,) = parse_numbers([found[1]], lines[1][0])
+    (frame_time,) = common.parse_numbers([found[1]], lines[1][0])
     if frame_time <= 0 or frames == 0:
         problem = "the frame time is not positive" if frames else "the motion has no frames"
         raise FileError(problem, place=f"line {lines[1 if frames else 0][0]}", remedy="Export the motion again.")
     values: list[list[float]] = []
     for n, row in rows:
-        numbers = parse_numbers(row.split(), n)
+        numbers = common.parse_numbers(row.split(), n)
         if len(numbers) != channels:
             raise FileError(
                 f"{len(numbers)} values for {channels} channels", place=f"line {n}",
@@ -223,7 +215,7 @@ def _local_poses(joints: Sequence[_BvhJoint], values: NDArray) -> NDArray:
         columns = values[:, at : at + len(joint.channels)]
         at += len(joint.channels)
         turns = [k for k, channel in enumerate(joint.channels) if channel.endswith("rotation")]
-        Ts_parent_joint[:, i, :3, :3] = euler_rotations(
+        Ts_parent_joint[:, i, :3, :3] = common.euler_rotations(
             np.radians(columns[:, turns]), [joint.channels[k][0] for k in turns]
         )
         Ts_parent_joint[:, i, :3, 3] = joint.offset
@@ -257,7 +249,7 @@ def _human_unit(names: Sequence[str], parents: Sequence[int], offsets: NDArray) 
     The stature is the length of the bones from head to ankle, independent of the pose; the extent of the rest pose
     if no joint is named as head and feet.
     """
-    head, feet = landmarks(names)
+    head, feet = common.landmarks(names)
     if head is not None and feet:
         chains = [set(_chain(head, parents)) ^ set(_chain(foot, parents)) for foot in feet]
         lengths = np.linalg.norm(offsets, axis=1)

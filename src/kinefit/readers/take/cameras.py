@@ -184,6 +184,14 @@ def stated_rate(rate: float | None, file: Path | None = None) -> float:
     return rate
 
 
+def turned_frame(calibrated: tuple[int, int], size: tuple[int, int], degrees: int, image: str) -> ImageFrame:
+    """Image frame of a video that was rotated clockwise [deg], then "scaled" or "letterboxed" (or neither)."""
+    frame = ImageFrame.rotated(calibrated, degrees)
+    turned = calibrated if degrees % 180 == 0 else calibrated[::-1]
+    make = {"scaled": ImageFrame.scaled, "letterboxed": ImageFrame.letterboxed}.get(image)
+    return frame.then(make(turned, size)) if make else frame
+
+
 def image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int] | None, take: Take) -> ImageFrame:
     """How the image of a camera relates to the calibration's.
 
@@ -198,13 +206,8 @@ def image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int]
     calibrated = rig[entry.name].size
     turned = calibrated if entry.rotation % 180 == 0 else calibrated[::-1]
     size = video_size or entry.size or turned
-    frame = ImageFrame.rotated(calibrated, entry.rotation)
-    if entry.image == "scaled":
-        return frame.then(ImageFrame.scaled(turned, size))
-    if entry.image == "letterboxed":
-        return frame.then(ImageFrame.letterboxed(turned, size))
-    if size == turned:
-        return frame
+    if entry.image != "as calibrated" or size == turned:
+        return turned_frame(calibrated, size, entry.rotation, entry.image)
     ratio = size[0] * turned[1] / (size[1] * turned[0])
     line = (
         "rotation = 90 (or 270)" if size == turned[::-1]

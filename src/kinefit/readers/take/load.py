@@ -11,23 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit import observations
 from kinefit._arguments import checked
 from kinefit.bodies.motion import UP_AXES
 from kinefit.errors import FileError, ObservationError, TakeError, command, located
 from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.geometry.force_plates import ForcePlate
-from kinefit.observations import (
-    MEDIAPIPE_33,
-    ClickVideo,
-    CloudVideo,
-    DepthVideo,
-    Keypoints,
-    KeypointVideo,
-    LineVideo,
-    Markers,
-    SensorRecording,
-)
 from kinefit.observations.clocks import frame_times, is_even, on_steps
 from kinefit.readers.calibration.read import found_notes
 from kinefit.readers.landmarks.detections import detections_file, read_detections
@@ -35,32 +25,12 @@ from kinefit.readers.landmarks.keypoint_sets import FACE_SET
 from kinefit.readers.landmarks.keypoints import read_keypoints
 from kinefit.readers.markers import read_markers
 from kinefit.readers.plates import PlatesRead, read_force_file
-from kinefit.readers.take.cameras import (
-    TakeCameras,
-    assumed_camera,
-    image_frame,
-    is_alone,
-    is_uncalibrated,
-    read_rig,
-    stated_frame,
-    stated_rate,
-    what_is_assumed,
-)
+from kinefit.readers.take import cameras as rigs
+from kinefit.readers.take import entries
 from kinefit.readers.take.checks import refuse_streams
-from kinefit.readers.take.clicks import load_clicks
 from kinefit.readers.take.depth import depth_notes, load_depth
-from kinefit.readers.take.entries import (
-    KeypointsEntry,
-    MarkersEntry,
-    PlateEntry,
-    Take,
-    old_attribute,
-    read_each,
-    sensor_name,
-    title_of,
-)
 from kinefit.readers.take.kinds import KINDS, SensorKind
-from kinefit.readers.take.skin import load_skin
+from kinefit.readers.take.points import load_clicks, load_skin
 from kinefit.readers.videos.video import Video, common_frames
 
 _MIN_COMMON_FRAMES = 10  # without a calibration: fewer tell neither clocks nor places of cameras
@@ -74,7 +44,7 @@ class TakeSensor:
 
     kind: SensorKind
     entry: Any
-    recording: SensorRecording
+    recording: observations.SensorRecording
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,27 +88,27 @@ class Observations:
     rate: float
     frames: tuple[int, int]
     rig: Rig | None
-    keypoints: tuple[Keypoints, ...]
-    markers: tuple[Markers, ...]
+    keypoints: tuple[observations.Keypoints, ...]
+    markers: tuple[observations.Markers, ...]
     videos: dict[str, Path]
     images: dict[str, ImageFrame]
-    depth: tuple[DepthVideo, ...] = ()
-    clouds: tuple[CloudVideo, ...] = ()
-    skin: tuple[KeypointVideo, ...] = ()
-    clicks: tuple[ClickVideo, ...] = ()
+    depth: tuple[observations.DepthVideo, ...] = ()
+    clouds: tuple[observations.CloudVideo, ...] = ()
+    skin: tuple[observations.KeypointVideo, ...] = ()
+    clicks: tuple[observations.ClickVideo, ...] = ()
     sensors: tuple[TakeSensor, ...] = ()
     notes: tuple[str, ...] = ()
     first_time: float = 0.0
-    static_markers: tuple[Markers | None, ...] = ()
+    static_markers: tuple[observations.Markers | None, ...] = ()
     plates: tuple[ForcePlate, ...] = ()
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            return self.of_kind(old_attribute(name, "Observations.of_kind"))
+            return self.of_kind(entries.old_attribute(name, "Observations.of_kind"))
 
     @property
-    def recordings(self) -> tuple[SensorRecording, ...]:
+    def recordings(self) -> tuple[observations.SensorRecording, ...]:
         """Every recording with `at_step(step, rate)` and `frame(i)`: all but keypoints and markers."""
         of_kinds = (sensor.recording for sensor in self.sensors)
         return (*self.depth, *self.clouds, *of_kinds, *self.skin, *self.clicks)
@@ -148,7 +118,7 @@ class Observations:
         return tuple(sensor.recording for sensor in self.sensors if sensor.kind.table == table)
 
 
-def _load_sensors(cameras: TakeCameras) -> tuple[TakeSensor, ...]:
+def _load_sensors(cameras: rigs.TakeCameras) -> tuple[TakeSensor, ...]:
     """The sensors of all kinds of a take.
 
     Raises
@@ -157,21 +127,21 @@ def _load_sensors(cameras: TakeCameras) -> tuple[TakeSensor, ...]:
         A kind of another distribution raises an error, or returns no recording of the sensor's name.
     """
     out = list[TakeSensor]()
-    for table, entries in cameras.take.sensors.items():
+    for table, listed in cameras.take.sensors.items():
         kind = KINDS.get(table)
-        for k, entry in enumerate(entries):
-            name = sensor_name(kind.label or table, entries, k)
+        for k, entry in enumerate(listed):
+            name = entries.sensor_name(kind.label or table, listed, k)
             valid = lambda r, name=name, kind=kind: (
-                isinstance(r, SensorRecording) and (r.sensor == name or kind.sensor is None)
+                isinstance(r, observations.SensorRecording) and (r.sensor == name or kind.sensor is None)
             )
-            with located(cameras.take.path, title_of(table, entry)):
+            with located(cameras.take.path, entries.title_of(table, entry)):
                 what = f"a SensorRecording of the sensor '{name}'"
                 out.append(TakeSensor(kind, entry, kind.call("read", entry, name, cameras, valid=valid, what=what)))
     return tuple(out)
 
 
 @checked
-def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
+def load_observations(take: entries.Take, *, exteriors: bool = True) -> Observations:
     """Read everything that a take names, and check that it fits together.
 
     Parameters
@@ -192,7 +162,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         A file that is damaged.
     """
     refuse_streams(take)
-    rig, found = read_rig(take, exteriors), found_notes(take.calibration)
+    rig, found = rigs.read_rig(take, exteriors), found_notes(take.calibration)
     rates: dict[str, float] = {}
     streams: dict[str, NDArray] = {}  # (N,) [s] in the take
     clocks: dict[str, NDArray] = {}  # (N,) [s] of each camera's video, from its first frame
@@ -212,13 +182,13 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     rate = take.rate or max(rates.values(), default=0.0)
     if not all(is_even(times, rate) for times in clocks.values()):
         notes.append(f"take {rate:.6g} Hz, {listed}: points are interpolated between frames")
-    if is_alone(take) or (is_uncalibrated(take) and not exteriors):
-        rig = Rig(tuple(assumed_camera(e, sizes.get(e.name, e.size), take) for e in take.cameras))
-    elif is_uncalibrated(take):
+    if rigs.is_alone(take) or (rigs.is_uncalibrated(take) and not exteriors):
+        rig = Rig(tuple(rigs.assumed_camera(e, sizes.get(e.name, e.size), take) for e in take.cameras))
+    elif rigs.is_uncalibrated(take):
         remedy = f"They are found from the people in view: {command('track', take.path)}, or find_cameras in Python."
         raise TakeError("cameras that are not calibrated yet", file=take.path, remedy=remedy)
-    images = {entry.name: image_frame(entry, rig, sizes.get(entry.name), take) for entry in take.cameras}
-    of_cameras = TakeCameras(take, rig, images, clocks, rates, streams, sizes)
+    images = {entry.name: rigs.image_frame(entry, rig, sizes.get(entry.name), take) for entry in take.cameras}
+    of_cameras = rigs.TakeCameras(take, rig, images, clocks, rates, streams, sizes)
     keypoints, markers = [], tuple(_read_markers(entry, entry.file) for entry in take.markers)
     static_markers = tuple(_read_markers(e, e.static) if e.static else None for e in take.markers)
     for number, source in enumerate(take.keypoints):
@@ -229,19 +199,19 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         streams[stream] = times + of_cameras.offset(source.camera)
         keypoints.append((read, streams[stream]))
     plates = [plate.shifted(e.time_offset) for e, m in zip(take.markers, markers) for plate in m.plates]
-    of_files = read_each(take, take.plates, partial(_read_plates, up=take.up))
+    of_files = entries.read_each(take, take.plates, partial(_read_plates, up=take.up))
     plates += [plate for read in of_files for plate in read.plates]
     notes += [f"[[plate]]: {text}" for read in of_files for text in read.notes]
     if len(once := _different(plates)) < len(plates):
         notes.append(f"{len(plates) - len(once)} force plates are named twice and count once")
     plates = once
-    deep = read_each(take, take.depth, partial(load_depth, cameras=of_cameras))
-    depth = tuple(video for video in deep if isinstance(video, DepthVideo))
-    clouds = tuple(video for video in deep if isinstance(video, CloudVideo))
+    deep = entries.read_each(take, take.depth, partial(load_depth, cameras=of_cameras))
+    depth = tuple(video for video in deep if isinstance(video, observations.DepthVideo))
+    clouds = tuple(video for video in deep if isinstance(video, observations.CloudVideo))
     sensors = _load_sensors(of_cameras)
-    skin = read_each(take, take.skin, partial(load_skin, cameras=of_cameras))
+    skin = entries.read_each(take, take.skin, partial(load_skin, cameras=of_cameras))
     fastest, clicks = of_cameras.fastest, load_clicks(of_cameras)
-    recordings: tuple[SensorRecording, ...] = (*depth, *clouds, *(sensor.recording for sensor in sensors))
+    recordings: tuple[observations.SensorRecording, ...] = (*depth, *clouds, *(sensor.recording for sensor in sensors))
     marked = [(f"[[markers]] {k}", e.time_offset + m.times) for k, (e, m) in enumerate(zip(take.markers, markers), 1)]
     if not (streams or clicks or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
@@ -250,9 +220,9 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     own = [*(recording.rate for recording in (*recordings, *clicks)), *(m.rate for m in markers)]
     rate = fastest or own[0]
     if streams:
-        overlap = is_uncalibrated(take) or bool(found)
+        overlap = rigs.is_uncalibrated(take) or bool(found)
         frames = common_frames(streams, rate, take.frames, overlap=overlap, file=take.path)
-        if is_uncalibrated(take) and frames[1] - frames[0] < _MIN_COMMON_FRAMES:
+        if rigs.is_uncalibrated(take) and frames[1] - frames[0] < _MIN_COMMON_FRAMES:
             shortest = min(streams, key=lambda stream: len(streams[stream]))
             problem = f"all cameras together saw {frames[1] - frames[0]} frames; the shortest is {shortest}, with "
             problem += f"{len(streams[shortest])}"
@@ -264,7 +234,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         if overlap and not take.frames and whole > 1.1 * common:
             notes.append(f"all cameras saw {common:.3g} s, the longest {whole:.3g} s")
     elif recordings or clicks:
-        dense = [recording for recording in recordings if not isinstance(recording, LineVideo)]
+        dense = [recording for recording in recordings if not isinstance(recording, observations.LineVideo)]
         frames = take.frames or _span(dense or recordings or clicks, rate)
     else:
         first_time = float(min(times[0] for _, times in marked))
@@ -273,8 +243,8 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         seen = min(starts), max(start + len(m) / m.rate for start, m in zip(starts, shown))
         notes += [note for m, all_of in zip(shown, markers) for note in m.notes[len(all_of.notes) :] if not take.frames]
         frames, marked = take.frames or (round((seen[0] - first_time) * rate), round((seen[1] - first_time) * rate)), []
-    kinds = {LineVideo: "lines of camera ", KeypointVideo: "keypoints of camera ", DepthVideo: "depth ",
-             CloudVideo: "depth "}  # fmt: skip
+    kinds = {observations.LineVideo: "lines of camera ", observations.KeypointVideo: "keypoints of camera "}
+    kinds |= dict.fromkeys((observations.DepthVideo, observations.CloudVideo), "depth ")
     others = [(f"{kinds.get(type(r), '')}{r.sensor}", r.times) for r in (*recordings, *skin)]
     clocks_of_plates = [(plate.name, plate.times - first_time) for plate in plates]
     _check_times([*others, *marked, *clocks_of_plates], frames, rate, take)
@@ -293,19 +263,19 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         videos={e.name: e.video for e in take.cameras if e.video is not None}, images=images,
         depth=depth, clouds=clouds, sensors=sensors, skin=skin,
         clicks=tuple(c for c in clicks if _within(np.rint(c.times * rate), [frames]).any()),
-        notes=(*notes, *found, *what_is_assumed(take)),
+        notes=(*notes, *found, *rigs.what_is_assumed(take)),
         first_time=first_time,
     )
 
 
-def _span(recordings: Sequence[SensorRecording], rate: float) -> tuple[int, int]:
+def _span(recordings: Sequence[observations.SensorRecording], rate: float) -> tuple[int, int]:
     """Steps from the first frame of any recording to the last."""
     first, last = min(r.times[0] for r in recordings), max(r.times[-1] for r in recordings)
     return round(float(first) * rate), round(float(last) * rate) + 1
 
 
 def _check_times(
-    recordings: Sequence[tuple[str, NDArray]], frames: tuple[int, int], rate: float, take: Take
+    recordings: Sequence[tuple[str, NDArray]], frames: tuple[int, int], rate: float, take: entries.Take
 ) -> None:
     """Refuse what was not recorded at the time of the rest; place and times (F,) [s] of each."""
     for place, times in recordings:
@@ -319,7 +289,9 @@ def _check_times(
             )  # fmt: skip
 
 
-def _read_keypoints(source: KeypointsEntry, cameras: TakeCameras, number: int) -> tuple[Keypoints, NDArray]:
+def _read_keypoints(
+    source: entries.KeypointsEntry, cameras: rigs.TakeCameras, number: int
+) -> tuple[observations.Keypoints, NDArray]:
     """Keypoints of a camera, and the times (F,) [s] of their frames from the first on."""
     place = f"[[keypoints]] {number + 1}, camera {source.camera}"
     take, image, rates = cameras.take, cameras.images[source.camera], cameras.rates
@@ -327,12 +299,12 @@ def _read_keypoints(source: KeypointsEntry, cameras: TakeCameras, number: int) -
     if source.format == "detect":
         file = source.file or detections_file(take.path, source.camera)
         found = read_detections(file)
-        frame, face = stated_frame(image, "video", "keypoints"), source.set == FACE_SET
+        frame, face = rigs.stated_frame(image, "video", "keypoints"), source.set == FACE_SET
         seen = found.keypoints(source.camera, image_frame=frame, time_offset=offset, face=face)
         return seen, frame_times(len(found), found.rate, clock if found.times is None else found.times)
     with located(take.path, place):
-        frame = stated_frame(image, source.frame, "keypoints")
-        rate = stated_rate(source.rate or rates.get(f"video {source.camera}") or take.rate)
+        frame = rigs.stated_frame(image, source.frame, "keypoints")
+        rate = rigs.stated_rate(source.rate or rates.get(f"video {source.camera}") or take.rate)
     assert source.file is not None
     options: dict[str, Any] = {"keypoint_set": source.set} if source.format == "openpose" and source.set else {}
     record = read_keypoints(
@@ -347,10 +319,10 @@ def _read_keypoints(source: KeypointsEntry, cameras: TakeCameras, number: int) -
             place=place, remedy="Remove rate from [[keypoints]]: they take the times of the video's frames.",
         )
     hands_unwanted = source.set == "MEDIAPIPE_33" and record.keypoint_set == "MEDIAPIPE_75"
-    return record.first_points(source.set, MEDIAPIPE_33) if source.set and hands_unwanted else record, times
+    return record.first_points("MEDIAPIPE_33", observations.MEDIAPIPE_33) if hands_unwanted else record, times
 
 
-def _read_markers(entry: MarkersEntry, file: Path) -> Markers:
+def _read_markers(entry: entries.MarkersEntry, file: Path) -> observations.Markers:
     """The marker recording of an entry, or its static trial, in the take's world."""
     markers = read_markers(file, unit=entry.unit)
     markers = markers.sided(entry.sides) if entry.sides else markers
@@ -361,7 +333,7 @@ def _read_markers(entry: MarkersEntry, file: Path) -> Markers:
     return replace(markers, positions=se3.apply(T, markers.positions), up=up, plates=plates)
 
 
-def _read_plates(entry: PlateEntry, up: str) -> PlatesRead:
+def _read_plates(entry: entries.PlateEntry, up: str) -> PlatesRead:
     """Force plates of a file of their own, in the take's world and by its clock."""
     if entry.file.suffix.lower() == ".c3d":
         markers = read_markers(entry.file)
@@ -398,8 +370,9 @@ def _named_apart(plates: Sequence[ForcePlate]) -> tuple[ForcePlate, ...]:
 
 
 def _cut(
-    keypoints: Keypoints, times: NDArray, rate: float, frames: tuple[int, int], entry: KeypointsEntry
-) -> Keypoints:
+    keypoints: observations.Keypoints, times: NDArray, rate: float, frames: tuple[int, int],
+    entry: entries.KeypointsEntry,
+) -> observations.Keypoints:  # fmt: skip
     """Keypoints at the steps [start, stop) of the common time, with what their entry states of ranges of steps."""
     if is_even(times, rate):
         begin = frames[0] - round(keypoints.time_offset * rate)

@@ -1,4 +1,4 @@
-"""Frame-exact videos: files, image folders, topics of ROS 2; one (`Video`) or several in step (`VideoSet`)."""
+"""Frame-exact videos (`Video`): files, image folders, topics of ROS 2; the steps that several of them share."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._pictures import read_picture
-from kinefit.errors import FileError, ObservationError, choices, located
+from kinefit.errors import FileError, ObservationError, located
 from kinefit.observations.clocks import frame_times, frames_by_name, is_even, steps_of, unevenness
 from kinefit.readers.depth.images import listed
 from kinefit.readers.ros.images import McapVideo
@@ -95,76 +95,6 @@ class Video:
         """Yield frames `start` to `stop`, exclusive (default: the end), as (H, W, 3) uint8 RGB."""
         for i in range(start, len(self) if stop is None else stop):
             yield self.read(i)
-
-
-class VideoSet:
-    """Several videos at common times: for each time, the nearest frame of every camera.
-
-    Parameters
-    ----------
-    paths : {camera: path}
-    time_offsets : {camera: float [s]}, optional
-        Common time minus the video's own time; default 0.
-    rate : float [Hz], optional
-        Of image folders, which state none.
-    frames : (start, stop), optional
-        Steps of the common time to use, t = step / rate, of the highest rate; default: all that every camera recorded.
-
-    Raises
-    ------
-    ObservationError
-        Streams of different length without `frames`; the message lists all lengths.
-    """
-
-    def __init__(
-        self,
-        paths: Mapping[str, str | PathLike[str]],
-        time_offsets: Mapping[str, float] | None = None,
-        *,
-        rate: float | None = None,
-        frames: tuple[int, int] | None = None,
-    ) -> None:
-        if not paths:
-            raise ObservationError("no videos", remedy="Name at least one camera and its file.")
-        for camera in time_offsets or {}:
-            if camera not in paths:
-                raise ObservationError(f"time offset: {choices('camera', camera, paths)}")
-        self.videos: dict[str, Video] = {}
-        try:
-            for camera, path in paths.items():
-                self.videos[camera] = Video(path, rate=rate)
-            self.rate: float = max(video.rate for video in self.videos.values())
-            offsets = {c: (time_offsets or {}).get(c, 0.0) for c in paths}
-            clocks = {c: video.times + offsets[c] for c, video in self.videos.items()}
-            start, stop = common_frames(clocks, self.rate, frames)
-        except BaseException:
-            self.close()
-            raise
-        self.times: NDArray = np.arange(start, stop) / self.rate  # (N,) [s] of the take
-        self._frames = {c: [v.frame_at(t - offsets[c]) or 0 for t in self.times] for c, v in self.videos.items()}
-
-    def __len__(self) -> int:
-        return len(self.times)
-
-    def __enter__(self) -> VideoSet:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
-
-    def __iter__(self) -> Iterator[dict[str, NDArray[np.uint8]]]:
-        return (self.read(i) for i in range(len(self)))
-
-    def close(self) -> None:
-        """Close all files."""
-        for video in self.videos.values():
-            video.close()
-
-    def read(self, i: int) -> dict[str, NDArray[np.uint8]]:
-        """{camera: (H, W, 3) uint8 RGB} at `times[i]`; raises ObservationError for a step that is not there."""
-        if not 0 <= i < len(self):
-            raise ObservationError(f"no step {i}; there are 0 to {len(self) - 1}", place="videos")
-        return {camera: video.read(self._frames[camera][i]) for camera, video in self.videos.items()}
 
 
 def common_frames(

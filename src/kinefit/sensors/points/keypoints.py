@@ -19,17 +19,7 @@ from kinefit.observations import KEYPOINTS, KeypointFrame, Keypoints
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.channels import Channels, known_points, make_channels
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence, moves_points
-from kinefit.sensors.points.views import (
-    HandViews,
-    ViewBias,
-    find_swaps,
-    join_fingers,
-    limb_groups,
-    rays,
-    triangulated_frame,
-    trunks,
-    view_offset,
-)
+from kinefit.sensors.points import views
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.visibility.occlusion import MIN_VISIBLE_CONFIDENCE, Hidden, hidden_points
 from kinefit.solving.correspondences import _kernels
@@ -63,7 +53,7 @@ class Layout:
     @cached_property
     def groups(self) -> NDArray:
         """(N,) channels that change sides together."""
-        return limb_groups(self.body, self.channels)
+        return views.limb_groups(self.body, self.channels)
 
     @cached_property
     def informs(self) -> NDArray:
@@ -71,9 +61,9 @@ class Layout:
         return informing(self.body, self.channels)
 
     @cached_property
-    def hands(self) -> tuple[HandViews, ...]:
+    def hands(self) -> tuple[views.HandViews, ...]:
         """The hands with fingers, and which channels are on them."""
-        return HandViews.of(self.body, self.channels, self.points)
+        return views.HandViews.of(self.body, self.channels, self.points)
 
     @cached_property
     def parts(self) -> list[tuple[str, NDArray, tuple[str, ...], NDArray]]:
@@ -85,7 +75,7 @@ class Layout:
     @cached_property
     def trunk(self) -> NDArray:
         """(N,) segment in whose frame a channel's view bias is given."""
-        return trunks(self.body.tree)[self.points.segments]
+        return views.trunks(self.body.tree)[self.points.segments]
 
     def bias(self, scene: Scene) -> NDArray | None:
         """(N, 2) [px] bias of each keypoint in the image at a scene's state; None without a `view_bias`."""
@@ -93,7 +83,7 @@ class Layout:
         if bias is None:
             return None
         x = scene.positions(self.points_of(scene.body))
-        return view_offset(bias, self.trunk, x, scene.frames, scene.rig, self.channels.camera)
+        return views.view_offset(bias, self.trunk, x, scene.frames, scene.rig, self.channels.camera)
 
     def points_of(self, body: Body) -> PointSet:
         """`points` of another body with the same segments; cached for the latest body."""
@@ -168,10 +158,10 @@ class KeypointSensor(Sensor):
 
     def __init__(
         self, rig: Rig, sigma: Mapping[str, float], default_sigma: float, loss: Loss, near: float,
-        view_bias: ViewBias | None = None,
+        view_bias: views.ViewBias | None = None,
     ) -> None:  # fmt: skip
         self.rig, self.sigma, self.default_sigma, self.loss, self.near = rig, sigma, default_sigma, loss, near
-        self.view_bias = view_bias or ViewBias()
+        self.view_bias = view_bias or views.ViewBias()
         self._layouts: dict[tuple[object, ...], tuple[Layout, NDArray]] = {}
 
     def prepare(self, frame: Sequence[KeypointFrame], scene: Scene) -> KeypointMeasurement:
@@ -248,7 +238,7 @@ class KeypointMeasurement(Measurement):
         fitted = projected(scene, self.layout)
         view_offset = self.layout.bias(scene)
         looked_for = fitted if view_offset is None else fitted + view_offset
-        swapped = find_swaps(channels, self.layout.groups, self.uv, self.weight, looked_for, self.sides_known)
+        swapped = views.find_swaps(channels, self.layout.groups, self.uv, self.weight, looked_for, self.sides_known)
         order = np.where(swapped, channels.partner, np.arange(len(swapped)))
         uv, weight = np.ascontiguousarray(self.uv[order]), np.ascontiguousarray(self.weight[order])
         if view_offset is not None:
@@ -265,8 +255,8 @@ class KeypointMeasurement(Measurement):
     def hints(self, scene: Scene) -> Hints:
         """Points on which two cameras agree, and a ray of each point from a camera that sees it."""
         channels = self.layout.channels.with_points(scene.body)
-        x, _ = triangulated_frame(channels, self.uv, self.confidence)
-        return Hints(channels.points, x, rays(channels, self.uv, self.weight > 0))
+        x, _ = views.triangulated_frame(channels, self.uv, self.confidence)
+        return Hints(channels.points, x, views.rays(channels, self.uv, self.weight > 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -371,7 +361,7 @@ class KeypointMatched(Matched):
         right, wrong = seen & agrees, seen & ~agrees
         agreeing, contrary = MIN_VISIBLE_OUTLINE * (informs @ right), MIN_VISIBLE_OUTLINE * (informs @ wrong)
         if hands := self.measurement.layout.hands:
-            join_fingers(hands, agreeing, contrary, *self._metres(scene))
+            views.join_fingers(hands, agreeing, contrary, *self._metres(scene))
         return Evidence(agreeing, contrary, self._elsewhere(right, wrong))
 
     def _metres(self, scene: Scene) -> tuple[NDArray, NDArray]:
@@ -398,10 +388,10 @@ class KeypointMatched(Matched):
         if len(which) < 2:
             return None
         points, row = np.unique(channels.column[which], return_inverse=True)
-        views = np.full((len(points), len(channels.rig), 2), np.nan)
-        views[row, channels.camera[which]] = self.uv[which]
+        uv = np.full((len(points), len(channels.rig), 2), np.nan)
+        uv[row, channels.camera[which]] = self.uv[which]
         limit = AGREEMENT_SIGMAS * float(channels.sigma[which].max())
-        there = np.isfinite(triangulate_robust(channels.rig, views, max_residual_px=limit)[0]).all(axis=1)
+        there = np.isfinite(triangulate_robust(channels.rig, uv, max_residual_px=limit)[0]).all(axis=1)
         out[:] = False
         out[owner[which[there[row]]]] = True
         return out if out.any() else None

@@ -23,8 +23,8 @@ from kinefit.bodies import Body, KinematicTree, PointSet
 from kinefit.bodies.limbs import finger_groups
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.lines import triangulate_robust
+from kinefit.sensors import _kernels
 from kinefit.sensors.channels import Channels, exchange
-from kinefit.sensors.points import _kernels_view_bias as _kernels
 
 TERMS = 5
 MIRRORED = np.outer((1.0, 1.0, -1.0, 1.0, -1.0), (1.0, 1.0, -1.0))

@@ -165,7 +165,7 @@ def learn(
     """Learn one image, cell by cell (its upper left pixel), every `step`-th row of cells from `row` on.
 
     depth (H, W) [m], 0 for none; rays, camera as in `gated_points`; low, high (3,) [m]: box that the body may be in;
-    drawn (h, w) at any size: inf outside the body and its margin; variance = (a, b): a + b z⁴ of a depth
+    drawn (h, w) at any size: 0 outside the body and its margin; variance = (a, b): a + b z⁴ of a depth
     z, until it is learnt; gate: squared sigmas of an outlier; wait: images that an object new in the box must stay;
     learns_near: whether such objects may be learnt at all.
     In place: mean [m], spread [m²] of it, count of measurements (0: unknown), waiting: images in which a new object was
@@ -205,7 +205,7 @@ def learn(
             y = r01 * a + r11 * b + r21 * c
             w = r02 * a + r12 * b + r22 * c
             near = low[0] < x < high[0] and low[1] < y < high[1] and low[2] < w < high[2]
-            own = drawn[i * drawn.shape[0] // rows, j * drawn.shape[1] // columns] < math.inf
+            own = drawn[i * drawn.shape[0] // rows, j * drawn.shape[1] // columns] > 0
             forget = own and z < front  # it occludes the body, which may reappear behind it at any time
             if near:
                 may = learns_near and not own
@@ -233,21 +233,6 @@ def mark(depth, bound, cell, first, last):
                 for u in range(j * cell, right):
                     z = depth[v, u]
                     depth[v, u] = -z if z > bound[i, j] else z
-
-
-@jit
-def widened(drawn, reach, out):
-    """Write to out (h, w) 0 where a body is rendered, and up to `reach` pixels about it; inf elsewhere."""
-    rows, columns = drawn.shape
-    for i in range(rows):
-        for j in range(columns):
-            out[i, j] = math.inf
-    for i in range(rows):
-        for j in range(columns):
-            if drawn[i, j] < math.inf:
-                for a in range(i - reach if i > reach else 0, i + reach + 1 if i + reach < rows else rows):
-                    for b in range(j - reach if j > reach else 0, j + reach + 1 if j + reach < columns else columns):
-                        out[a, b] = 0.0
 
 
 @jit

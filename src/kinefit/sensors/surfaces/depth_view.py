@@ -253,8 +253,7 @@ class Background:
             self._variance = self._prior_variance(float(np.median(shown[seen])) if seen.any() else 2.0)
         if self._empty and not sure:
             return
-        about = np.empty(shown.shape, np.float32)
-        kernels.widened(shown, _BODY_MARGIN_PX, about)
+        about = cv2.dilate(seen.astype(np.uint8), np.ones((2 * _BODY_MARGIN_PX + 1,) * 2, np.uint8))
         kernels.learn(
             depth, self.camera.ray_table, self.camera.packed, *box, about, self._cell,
             *((0, 1) if self._empty else (self._turn, _ROW_INTERLEAVE)), self._variance, _OUTLIER_SIGMAS**2,

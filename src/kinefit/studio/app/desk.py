@@ -10,10 +10,9 @@ from typing import Any
 
 from kinefit.errors import KinefitError
 from kinefit.studio.app.jobs import Job, JobQueue
+from kinefit.studio.app.live import Recorder
 from kinefit.studio.app.people import PeoplePictures
-from kinefit.studio.app.review import Comparison, Review
-from kinefit.studio.app.served import FilePages
-from kinefit.studio.app.webcams import Recorder
+from kinefit.studio.app.review import Comparison, FilePages, Review
 
 
 class Desk:

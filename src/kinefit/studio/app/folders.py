@@ -16,7 +16,7 @@ from kinefit.readers.depth.images import PICTURES, natural
 from kinefit.readers.guess.files import VIDEOS
 from kinefit.readers.take.file import read_take, takes_in
 from kinefit.readers.videos.video import ENDINGS
-from kinefit.takes.batch.inputs import is_outdated
+from kinefit.takes.batch.corrections import is_outdated
 
 NEW = "new"
 UNFINISHED = "unfinished"

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import KinefitError, TrackingError
+from kinefit.exporters.report.page import scaled
 from kinefit.fitting.multiview.people import PersonTrack
 from kinefit.readers.landmarks.detections import detections_key
 from kinefit.readers.take.cameras import is_uncalibrated
@@ -33,15 +34,6 @@ def jpeg(image: NDArray[np.uint8], longest: int) -> bytes:
     """An RGB image (H, W, 3) as JPEG, its longer side scaled down to at most `longest` [px]."""
     small = scaled(image, longest)
     return cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
-
-
-def scaled(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
-    """An image (H, W, 3) whose longer side has at most `longest` [px]."""
-    share = longest / max(image.shape[:2])
-    if share >= 1.0:
-        return image
-    size = max(1, round(share * image.shape[1])), max(1, round(share * image.shape[0]))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def unrecognisable(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

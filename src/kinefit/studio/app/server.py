@@ -11,7 +11,7 @@ from typing import Any
 
 from websockets.datastructures import Headers
 
-from kinefit.errors import ExportError
+from kinefit.errors import ExportError, extra
 from kinefit.studio.serving.access import APP_PAGES, Access, Refusal
 from kinefit.studio.serving.server import HEADERS, listen
 
@@ -104,15 +104,12 @@ def serve(root: Path, port: int, access: Access, opened: Callable[[int], None]) 
     ExportError
         NiceGUI is missing, or no port is free.
     """
-    try:
-        with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
-            import uvicorn
-            from fastapi import FastAPI
-            from nicegui import app as pages
-            from nicegui import ui
-    except ImportError as error:
-        remedy = "Install it: pip install 'kinefit[app]'."
-        raise ExportError("kinefit app needs the package NiceGUI", remedy=remedy) from error
+    known = warnings.catch_warnings(action="ignore", category=DeprecationWarning)
+    with extra("app", "kinefit app needs the package NiceGUI", ExportError), known:
+        import uvicorn
+        from fastapi import FastAPI
+        from nicegui import app as pages
+        from nicegui import ui
     from kinefit.studio.app.desk import Desk
     from kinefit.studio.app.pages.routes import add_pages
 

@@ -6,7 +6,8 @@ Each step is written as a row of fixed size, so that memory does not grow; at th
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -29,6 +30,16 @@ _TAKE_HEAD = "# Recorded by kinefit live: kinefit track fits the whole session."
 _K = len(MEDIAPIPE_33)
 _ROW_LENGTH = 1 + 2 * _K + _K + 3 * _K  # time, pixels, confidence, lifted
 _MAX_IMAGE_GAP = 1.5  # frames between two images, up to which a step between them is interpolated
+_REMEDY = "Free some space, or give another folder with --out."
+
+
+@contextmanager
+def written(file: Path, remedy: str) -> Iterator[None]:
+    """What the system refuses within, as an ExportError of this file with its remedy."""
+    try:
+        yield
+    except OSError as error:
+        raise ExportError(f"cannot be written ({error.strerror})", file=file, remedy=remedy) from error
 
 
 class SeenRecord:
@@ -54,14 +65,12 @@ class SeenRecord:
         self.folder, self.take, self.rig, self.rate, self.alone = Path(folder), take, rig, rate, alone
         self.path: Path | None = None
         self._files: dict[str, BinaryIO] = {}
-        try:
+        with written(self.folder, _REMEDY):
             self.folder.mkdir(parents=True, exist_ok=True)
             other = self.folder / _TAKE_FILE
             if other.exists() and not regular(other).read_text(errors="replace").startswith(_TAKE_HEAD):
                 remedy = "Give another folder with --out."
                 raise ExportError("the session would overwrite this take", file=other, remedy=remedy)
-        except OSError as error:
-            raise self._write_error(error) from error
 
     def keep(self, frames: Sequence[Any]) -> None:
         """Record the person's keypoints of one step; raises ExportError if they cannot be written."""
@@ -71,12 +80,10 @@ class SeenRecord:
             if f.names == MEDIAPIPE_33:
                 x = lifted.get(f.sensor, np.full((_K, 3), np.nan))
                 row = np.concatenate([[f.time], f.uv.ravel(), f.confidence, x.ravel()])
-                try:
+                with written(self.folder, _REMEDY):
                     if f.sensor not in self._files:
                         self._files[f.sensor] = open(self._spool(f.sensor), "wb")
                     self._files[f.sensor].write(row.tobytes())
-                except OSError as error:
-                    raise self._write_error(error) from error
 
     def restart(self) -> None:
         """Discard what is recorded, detections of another person."""
@@ -105,10 +112,6 @@ class SeenRecord:
 
     def _spool(self, camera: str) -> Path:
         return self.folder / f"{camera}.unfinished"
-
-    def _write_error(self, error: OSError) -> ExportError:
-        remedy = "Free some space, or give another folder with --out."
-        return ExportError(f"cannot be written ({error.strerror})", file=self.folder, remedy=remedy)
 
     def _detections(self, camera: str, rows: NDArray) -> Detections:
         F = len(rows)
@@ -183,12 +186,9 @@ class MotionRecord:
         self.folder, self.rate, self.up, self.name = Path(folder), rate, up, name
         self.path: Path | None = None
         self._body: Body | None = None
-        try:
+        with written(self.folder, "Give another folder with --out."):
             self.folder.mkdir(parents=True, exist_ok=True)
             self._file: BinaryIO = open(self.folder / _SPOOL, "wb")
-        except OSError as error:
-            problem = f"cannot be written ({error.strerror})"
-            raise ExportError(problem, file=self.folder, remedy="Give another folder with --out.") from error
         self._last: NDArray | None = None
         self._first = 0.0
         self._choice = self.dropped = 0
@@ -246,11 +246,8 @@ class MotionRecord:
         self._last = None
 
     def _write(self, row: NDArray) -> None:
-        try:
+        with written(self.folder / _SPOOL, "Free some space."):
             self._file.write(row.tobytes())
-        except OSError as error:
-            problem = f"cannot be written ({error.strerror})"
-            raise ExportError(problem, file=self.folder / _SPOOL, remedy="Free some space.") from error
 
 
 def _motion(rows: NDArray, body: Body, rate: float, up: str, name: str) -> Motion:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.motion import UP_AXES
 from kinefit.errors import ExportError
+from kinefit.exporters.report.page import scaled
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
 from kinefit.readers.videos.video import Video
@@ -89,14 +90,11 @@ def undistortion(camera: Camera, image: ImageFrame, view: PinholeView) -> NDArra
 
 def flatten(picture: NDArray[np.uint8], pixels: NDArray) -> NDArray[np.uint8]:
     """A delivered picture (H, W, 3) seen through `undistortion`'s map (h, w, 2): (h, w, 3), dark where nothing is."""
-    shrink = min(1.0, max(pixels.shape[:2]) / max(picture.shape[:2]))
-    if shrink < 1.0:  # by areas first: the map alone would skip pixels
-        size = (max(1, round(shrink * picture.shape[1])), max(1, round(shrink * picture.shape[0])))
-        ratio = np.array(size) / (picture.shape[1], picture.shape[0])
-        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-        pixels = (pixels + 0.5) * ratio - 0.5
+    small = scaled(picture, max(pixels.shape[:2]))  # by areas first: the map alone would skip pixels
+    if small is not picture:
+        pixels = (pixels + 0.5) * (np.array(small.shape[1::-1]) / picture.shape[1::-1]) - 0.5
     maps = np.nan_to_num(pixels, nan=-1e4).astype(np.float32)
-    out = cv2.remap(picture, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(40, 40, 40))
+    out = cv2.remap(small, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(40, 40, 40))
     return np.asarray(out, np.uint8)
 
 
@@ -199,11 +197,8 @@ def open_server(port: int, access: Access | None = None, *, label: str = "kinefi
         viser is not installed, no port is free, the host's name is not one of this computer, or this version of viser
         cannot be kept from foreign pages.
     """
-    try:
-        import viser
-    except ImportError as error:
-        remedy = "Install it: pip install viser."
-        raise ExportError("the 3D viewer needs the package viser", remedy=remedy) from error
+    import viser
+
     from kinefit.studio.serving.server import listen
 
     access = access or Access()

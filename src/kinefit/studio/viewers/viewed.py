@@ -6,21 +6,29 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from kinefit.errors import KinefitError, ObservationError
-from kinefit.readers.take.file import read_take
-from kinefit.takes.batch.inputs import OUTDATED, is_outdated
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import load_body
+from kinefit.bodies.motion import Motion
+from kinefit.errors import KinefitError, ObservationError, TrackingError
+from kinefit.fitting.multiview.followed import follow
+from kinefit.fitting.tracking.recording import Recording
+from kinefit.fitting.tracking.sizing import channels_of
+from kinefit.readers.motion import find_motion, read_motion
+from kinefit.readers.take.file import Take, read_take, takes_in
+from kinefit.readers.take.load import Observations, load_observations
+from kinefit.readers.take.videos import TakePictures
+from kinefit.sensors.points.views import triangulated
+from kinefit.sensors.settings import TrackSettings
+from kinefit.studio.viewers.show import ViewerContent
+from kinefit.studio.viewers.stage import CameraImages
+from kinefit.takes.batch.corrections import OUTDATED, is_outdated
 from kinefit.takes.batch.results import Step, silent
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from kinefit.bodies.motion import Motion
-    from kinefit.readers.take.file import Take
-    from kinefit.readers.take.load import Observations
-    from kinefit.studio.viewers.show import ViewerContent
-    from kinefit.takes.preparing.each_video import Tell
+from kinefit.takes.missing import find_cameras
+from kinefit.takes.preparing.each_video import Tell
+from kinefit.takes.preparing.faces import ensure_faces, shown_video
 
 
 def gather(
@@ -40,12 +48,6 @@ def gather(
     KinefitError
         A file is missing or invalid, or two takes are given.
     """
-    from kinefit.readers.motion import read_motion
-    from kinefit.readers.take.file import takes_in
-    from kinefit.readers.take.load import load_observations
-    from kinefit.studio.viewers.show import ViewerContent
-    from kinefit.takes.missing import find_cameras
-
     motions: list[Motion] = []
     beside: Path | None = None
     for source in sources:
@@ -79,12 +81,6 @@ def content_of(
 
     Where faces are hidden, they are looked for first; without `find`, images in which they are unknown are blurred.
     """
-    import numpy as np
-
-    from kinefit.studio.viewers.show import ViewerContent
-    from kinefit.studio.viewers.stage import CameraImages
-    from kinefit.takes.preparing.faces import ensure_faces, shown_video
-
     cameras = {camera.name: camera for camera in seen.rig or ()}
     offsets = {entry.name: entry.time_offset for entry in take.cameras}
     for motion in motions:
@@ -117,9 +113,6 @@ def has_same_cameras(motion: Motion, take: Take) -> bool:
 
 def _fitting(file: Path | None, name: str, tell: Tell) -> tuple[Take, Observations] | None:
     """The take beside a folder of results and what its sensors saw, where it can be read and is the motion's."""
-    from kinefit.readers.take.load import load_observations
-    from kinefit.takes.missing import find_cameras
-
     if file is None:
         return None
     try:
@@ -138,8 +131,6 @@ def _fitting(file: Path | None, name: str, tell: Tell) -> tuple[Take, Observatio
 
 def _in_folder(folder: Path) -> tuple[Path, Path | None]:
     """The motion file in a folder of results, and the take that it probably came from."""
-    from kinefit.readers.motion import find_motion
-
     file = find_motion(folder)
     name = folder.absolute().name
     places = [folder.absolute().with_name(f"{name.removesuffix('-kinefit')}.toml"), folder / "take" / "take.toml"]
@@ -148,17 +139,6 @@ def _in_folder(folder: Path) -> tuple[Path, Path | None]:
 
 def _triangulated(take: Take, seen: Observations, tell: Tell) -> NDArray | None:
     """(F, K, 3) [m] keypoints of the person where two cameras agree; None, and a note, without a person."""
-    import numpy as np
-
-    from kinefit.bodies import load_body
-    from kinefit.errors import TrackingError
-    from kinefit.fitting.multiview.followed import follow
-    from kinefit.fitting.tracking.recording import Recording
-    from kinefit.fitting.tracking.sizing import channels_of
-    from kinefit.readers.take.videos import TakePictures
-    from kinefit.sensors.points.views import triangulated
-    from kinefit.sensors.settings import TrackSettings
-
     if seen.rig is None or not seen.keypoints:
         return None
     sigma = [entry.sigma for entry in take.keypoints]

@@ -14,7 +14,7 @@ from kinefit._files import parse_toml, regular
 from kinefit.errors import ExportError, FileError, KinefitError, command, printable
 from kinefit.readers.take.file import is_default_take, is_take, takes_in
 from kinefit.takes.batch.one import Choices, TakeJob, work
-from kinefit.takes.batch.processes import Failure, run_here
+from kinefit.takes.batch.processes import Failure, run_here, run_there
 from kinefit.takes.batch.summary import RECORD, Row, failed, write_summary
 
 
@@ -177,6 +177,4 @@ def _results(
 ) -> Iterator[tuple[int, tuple[Row, ...] | Failure]]:
     if cluster is None:
         return run_here(work, jobs, workers=min(workers, len(jobs)), retries=retries, limit=limit)
-    from kinefit.takes.batch.cluster import run_there
-
     return run_there(work, jobs, address=cluster, retries=retries)

@@ -7,22 +7,33 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
-from kinefit._files import regular
+from kinefit._files import regular, write_bytes
+from kinefit.bodies.motion import Motion
 from kinefit.errors import KinefitError, TakeError, printable
-from kinefit.findings import of_provenance
+from kinefit.exporters.report.angles import ranges_of
+from kinefit.findings import NOTES, of_provenance
+from kinefit.fitting.multiview import followed
+from kinefit.fitting.tracking import cameras
+from kinefit.fitting.tracking.checkpoints.checkpoint import Checkpoint, key_of
+from kinefit.fitting.tracking.take_recording import floor_sentences
+from kinefit.fitting.tracking.video import TrackingInterrupted
+from kinefit.readers.take.cameras import is_uncalibrated
+from kinefit.readers.take.checks import check_enough, check_take
+from kinefit.readers.take.file import Take, read_take
+from kinefit.readers.take.kinds import kinds_of
+from kinefit.takes.batch import results
+from kinefit.takes.batch.corrections import OUTDATED, inputs_entry, is_outdated
 from kinefit.takes.batch.processes import progress
-from kinefit.takes.batch.results import DEFAULT_FORMATS, FORMATS, Step, check_formats, write_overlays, write_results
 from kinefit.takes.batch.summary import DONE, RECORD, Range, Row, failed, write_people_report
+from kinefit.takes.in_view import InView, people_in_view
+from kinefit.takes.missing import last_found, prepared
+from kinefit.takes.preparing.each_video import Tell
+from kinefit.takes.track import settings_of, track_take
 
-if TYPE_CHECKING:
-    from kinefit.bodies.motion import Motion
-    from kinefit.readers.take.file import Take
-    from kinefit.takes.in_view import InView
-    from kinefit.takes.preparing.each_video import Tell
 
 @dataclass(frozen=True)
 class Choices:
@@ -43,7 +54,7 @@ class Choices:
     hide_faces : bool, whether all faces are hidden in images; a take may set it too
     """
 
-    formats: tuple[str, ...] = DEFAULT_FORMATS
+    formats: tuple[str, ...] = results.DEFAULT_FORMATS
     overlays: bool = True
     overlay_skin: bool = False
     report: bool = True
@@ -85,10 +96,7 @@ def asked_take(path: Path, choices: Choices) -> Take:
     KinefitError
         The take or the named person is invalid, or a format cannot be written.
     """
-    from kinefit.readers.take.checks import check_enough, check_take
-    from kinefit.readers.take.file import read_take
-
-    check_formats(choices.formats)
+    results.check_formats(choices.formats)
     take = read_take(path)
     take = replace(take, hide_faces=take.hide_faces or choices.hide_faces)
     if choices.person is not None:
@@ -117,14 +125,11 @@ def check_drawable(take: Take, *, skin: bool = False) -> None:
         raise TakeError("the take has no video or depth for overlays", file=take.path, remedy="Leave out --overlays.")
 
 
-def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | None, list[tuple[Take, Path]]]:
+def people_of(take: Take, out: Path, step: results.Step, tell: Tell) -> tuple[InView | None, list[tuple[Take, Path]]]:
     """Find the people to track: the people in view (None if the take names one), and a take and a folder for each.
 
     What the take lacks is found first, as by `prepared`.
     """
-    from kinefit.takes.in_view import people_in_view
-    from kinefit.takes.missing import prepared
-
     take = prepared(take, step, tell)
     view = people_in_view(take) if take.person is None else None
     people = len(view.people) if view else 0
@@ -136,7 +141,8 @@ def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | N
 
 
 def track_person(
-    take: Take, out: Path, choices: Choices, *, view: InView | None, step: Step, tell: Tell, files: dict[str, Path],
+    take: Take, out: Path, choices: Choices, *, view: InView | None, step: results.Step, tell: Tell,
+    files: dict[str, Path],
 ) -> TrackedPerson:  # fmt: skip
     """Track one person of a take and write the results; written files are added to `files`.
 
@@ -147,17 +153,6 @@ def track_person(
     KinefitError
         Tracking or writing fails.
     """
-    from kinefit.findings import NOTES
-    from kinefit.fitting.multiview import followed
-    from kinefit.fitting.tracking import cameras
-    from kinefit.fitting.tracking.checkpoints.checkpoint import Checkpoint, key_of
-    from kinefit.fitting.tracking.take_recording import floor_sentences
-    from kinefit.fitting.tracking.video import TrackingInterrupted
-    from kinefit.readers.take.kinds import kinds_of
-    from kinefit.takes.batch.inputs import OUTDATED, inputs_entry, is_outdated
-    from kinefit.takes.batch.results import provenance, write_track_report
-    from kinefit.takes.track import settings_of, track_take
-
     notes: list[str] = []
     how: dict[str, Any] = {"smooth": choices.smooth, "contacts": choices.contacts, "lag": choices.lag}
     total, inputs = 0, inputs_entry(take)
@@ -182,14 +177,14 @@ def track_person(
             notes += [*motion.provenance.get(NOTES, ()), *floor_sentences(motion.provenance)]
         except TrackingInterrupted as stopped:
             motion, total = stopped.motion, stopped.total
-        motion = replace(motion, provenance=provenance(take, **inputs, **motion.provenance))
+        motion = replace(motion, provenance=results.provenance(take, **inputs, **motion.provenance))
         if is_outdated(motion.provenance, take.path):  # changed meanwhile
             notes.append(f"{OUTDATED}.")
-        write_results(motion, out, choices.formats, step, files)
+        results.write_results(motion, out, choices.formats, step, files)
         if choices.draws and not total:
-            write_overlays(motion, take, seen, out, step, files, skin=choices.overlay_skin)
+            results.write_overlays(motion, take, seen, out, step, files, skin=choices.overlay_skin)
         if choices.report and not total:
-            write_track_report(motion, take, seen, out, step, files, choices.pictures, notes)
+            results.write_track_report(motion, take, seen, out, step, files, choices.pictures, notes)
         if not total:
             unfinished.remove()
     return TrackedPerson(motion, tuple(notes), total)
@@ -227,17 +222,13 @@ def work(job: TakeJob) -> tuple[Row, ...]:
 
     Faults of the take are in its rows. Other errors are raised, since they may not occur again.
     """
-    from kinefit.fitting.tracking.checkpoints.checkpoint import key_of
-    from kinefit.readers.take.cameras import is_uncalibrated
-    from kinefit.takes.missing import last_found
-
     start, said = Row(take=job.label), list[str]()
     try:
         with _warnings_in(said):
             take = asked_take(job.take, job.choices)
         keys = ("subject", "visit", "date", "movement")
         start = msgspec.structs.replace(start, **{key: take.session.stated.get(key, "") for key in keys})
-        exporters = [plugin.code_digest for name in job.choices.formats for plugin in FORMATS.plugins(name)]
+        exporters = [plugin.code_digest for name in job.choices.formats for plugin in results.FORMATS.plugins(name)]
         key = key_of(take, **asdict(replace(job.choices, restart=False)), exporters=exporters)
         complete = not is_uncalibrated(last_found(take))  # whoever deletes found cameras wants others
     except KinefitError as error:
@@ -295,8 +286,6 @@ def _tracked(job: TakeJob, take: Take, start: Row, said: list[str]) -> tuple[tup
 
 def of_motion(row: Row, motion: Motion, notes: tuple[str, ...]) -> Row:
     """The row with a motion's length, quality, ranges of motion and findings."""
-    from kinefit.exporters.report.angles import ranges_of
-
     ranges = [
         Range(coordinate, side, *((r.lowest[0], r.highest[0], *r.span, r.share) if r else ()))
         for coordinate, sides in ranges_of(motion).items() for side, r in sides.items()
@@ -316,6 +305,5 @@ def _read(path: Path) -> _TakeRecord | None:
 
 
 def _write(path: Path, record: _TakeRecord) -> None:
-    from kinefit._files import write_bytes
 
     write_bytes(path, msgspec.json.encode(record))

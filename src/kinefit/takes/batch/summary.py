@@ -6,15 +6,17 @@ import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import mean, stdev
-from typing import TYPE_CHECKING
 
 import msgspec
 
+from kinefit._files import write_rows, write_text
+from kinefit._pictures import read_picture
 from kinefit.errors import ExportError
+from kinefit.exporters.report import page as p
+from kinefit.exporters.report.angles import with_error
+from kinefit.exporters.report.page import Html, finding_callout
+from kinefit.exporters.tables import spoken
 from kinefit.findings import Finding
-
-if TYPE_CHECKING:
-    from kinefit.exporters.report.page import Html
 
 RECORD = "batch.json"
 """File in every folder of results of a batch: the take, its key, the files and the summary rows."""
@@ -106,8 +108,6 @@ def write_summary(rows: Sequence[Row], folder: Path) -> None:
     ExportError
         There are no rows, or they cannot be written.
     """
-    from kinefit._files import write_rows, write_text
-
     if not rows:
         raise ExportError("there are no takes to summarise", file=folder, remedy="Give a pattern that matches takes.")
     table = [(*_ids(row), row.frames or "", *map(_number, (row.seconds, row.quality, row.lost)), row.status, row.error,
@@ -123,8 +123,6 @@ def write_summary(rows: Sequence[Row], folder: Path) -> None:
 
 def summary_page(rows: Sequence[Row], folder: Path) -> str:
     """HTML of summary.html, with links to the reports below `folder`."""
-    from kinefit.exporters.report import page as p
-
     done = [row for row in rows if row.status == DONE]
     takes, bad = len({row.take for row in rows}), len({row.take for row in rows if row.status != DONE})
     named = len({row.subject for row in rows if row.subject})
@@ -144,8 +142,6 @@ def summary_page(rows: Sequence[Row], folder: Path) -> str:
 
 def fault_boxes(rows: Iterable[Row]) -> list[Html]:
     """A callout for each fault of the inputs, with its take and person."""
-    from kinefit.exporters.report.page import finding_callout
-
     return [
         finding_callout(found, f"{row.take}{f', person {row.person}' if row.person else ''}")
         for row in rows for found in row.findings
@@ -153,7 +149,6 @@ def fault_boxes(rows: Iterable[Row]) -> list[Html]:
 
 
 def _takes(rows: Sequence[Row], folder: Path) -> Html:
-    from kinefit.exporters.report import page as p
 
     cells = [
         (_linked(row, folder, row.take), _person(row), row.subject, row.visit, row.date, row.movement, *outcome(row),
@@ -164,8 +159,6 @@ def _takes(rows: Sequence[Row], folder: Path) -> Html:
 
 def outcome(row: Row) -> tuple[str, ...]:
     """The cells of the columns `OUTCOME`; apart from the status empty for a failed row."""
-    from kinefit.exporters.report import page as p
-
     quality = "" if row.quality is None else p.shaded(f"{row.quality:.2f}", 1.0 - row.quality)
     lost = "" if row.lost is None else f"{100 * row.lost:.1f} %"
     return row.status, str(row.frames or ""), "" if row.seconds is None else f"{row.seconds:.2f}", quality, lost
@@ -173,9 +166,6 @@ def outcome(row: Row) -> tuple[str, ...]:
 
 def by_joint(rows: Sequence[Row]) -> Html:
     """A menu of coordinates, each with tables of ranges by take, and by subject and session."""
-    from kinefit.exporters.report import page as p
-    from kinefit.exporters.tables import spoken
-
     names = list(dict.fromkeys(r.coordinate for row in rows for r in row.ranges))
     pages = {}
     for name in names:
@@ -193,7 +183,6 @@ def by_joint(rows: Sequence[Row]) -> Html:
 
 def _cells(ranges: dict[str, Range], sides: Sequence[str]) -> list[str]:
     """Range of each side, and their difference."""
-    from kinefit.exporters.report.angles import with_error
 
     def cell(r: Range | None) -> str:
         if r is None or r.span is None or r.twice is None:
@@ -261,9 +250,6 @@ def write_people_report(rows: Sequence[Row], folder: Path, *, pictures: bool) ->
     ExportError
         The page cannot be written.
     """
-    from kinefit._files import write_text
-    from kinefit.exporters.report import page as p
-
     done = [row for row in rows if row.status == DONE]
     text = f"{len(done)} of {len(rows)} people in view were tracked. Each of them has its own results and report."
     cells = [(_linked(row, folder, f"person {row.person}"), *outcome(row)) for row in rows]
@@ -281,9 +267,6 @@ def write_people_report(rows: Sequence[Row], folder: Path, *, pictures: bool) ->
 
 def _parts_of_person(row: Row, folder: Path, pictures: bool) -> list[str]:
     """The montage of all cameras, the error and the notes of one person, and a link to the report."""
-    from kinefit._pictures import read_picture
-    from kinefit.exporters.report import page as p
-
     montage = folder / row.folder / "montage.png"
     has_montage = pictures and row.folder and montage.is_file()
     parts: list[str] = [p.picture(read_picture(montage), width=1400)] if has_montage else []
@@ -295,7 +278,5 @@ def _parts_of_person(row: Row, folder: Path, pictures: bool) -> list[str]:
 
 def _linked(row: Row, folder: Path, text: str) -> str:
     """A link to the row's report below a folder; the text alone where there is none."""
-    from kinefit.exporters.report import page as p
-
     report = f"{row.folder}/report.html"
     return p.file_link(report, text) if row.folder and (folder / report).is_file() else text

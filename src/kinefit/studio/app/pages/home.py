@@ -16,22 +16,10 @@ from kinefit.readers.assets import write_sample_take
 from kinefit.studio.app.desk import Desk
 from kinefit.studio.app.folders import SessionRow, openable_files, recordings, subfolders, takes_below
 from kinefit.studio.app.jobs import DONE, RUNNING
+from kinefit.studio.app.pages import shell as s
 from kinefit.studio.app.pages.result import text_table
-from kinefit.studio.app.pages.shell import (
-    card,
-    in_thread,
-    link,
-    loaded,
-    notified,
-    page_frame,
-    shell,
-    short,
-    show_error,
-    texts,
-)
 from kinefit.studio.app.pages.take import use_folder
 from kinefit.studio.app.review import Comparison
-from kinefit.studio.app.texts import Texts
 
 _MAX_UPLOAD_BYTES = 2**30  # of a dropped video; larger ones are opened where they are
 _MAX_NAMES = 6  # of videos that are listed
@@ -39,28 +27,28 @@ _MAX_NAMES = 6  # of videos that are listed
 
 async def home_page(desk: Desk) -> None:
     """Build the page."""
-    t = texts()
-    with shell(desk, t, t("shell.home")):
+    t = s.texts()
+    with s.shell(desk, t, t("shell.home")):
         if desk.hide_faces is None:
             _ask_faces(desk, t)
             return
         with ui.row().classes("w-full items-stretch"):
-            with ui.column().classes("flex-1 min-w-[300px]"), card(t("home.open_title")):
+            with ui.column().classes("flex-1 min-w-[300px]"), s.card(t("home.open_title")):
                 ui.label(t("home.open_text"))
                 _FolderChoice(desk, t)
-            with ui.column().classes("flex-1 min-w-[300px]"), card(t("home.drop_title")):
+            with ui.column().classes("flex-1 min-w-[300px]"), s.card(t("home.drop_title")):
                 _drop_area(desk, t)
-        with card(t("home.session_title", folder=desk.root)):
+        with s.card(t("home.session_title", folder=desk.root)):
             await _takes(desk, t)
             ui.button(t("home.demo"), icon="directions_run", on_click=lambda: _demo(desk)).props("flat no-caps")
 
 
-def _ask_faces(desk: Desk, t: Texts) -> None:
+def _ask_faces(desk: Desk, t: s.Texts) -> None:
     def choose(hide: bool) -> None:
         desk.hide_faces = hide
         ui.navigate.reload()
 
-    with card(t("home.faces_title")):
+    with s.card(t("home.faces_title")):
         ui.label(t("home.faces_text"))
         with ui.row():
             ui.button(t("home.hide"), icon="visibility_off", on_click=lambda: choose(True))
@@ -70,16 +58,16 @@ def _ask_faces(desk: Desk, t: Texts) -> None:
 async def _demo(desk: Desk) -> None:
     """Open the sample recording; it is written below the session's folder, unless it is there, with its corrections."""
     take = desk.root / "demo" / "take.toml"
-    with notified():
+    with s.notified():
         if not take.is_file():
-            await in_thread(write_sample_take, take.parent)
-        ui.navigate.to(link("/take", path=take))
+            await s.in_thread(write_sample_take, take.parent)
+        ui.navigate.to(s.link("/take", path=take))
 
 
 class _FolderChoice:
     """A list of folders to walk through by clicks, with a field for a path."""
 
-    def __init__(self, desk: Desk, t: Texts) -> None:
+    def __init__(self, desk: Desk, t: s.Texts) -> None:
         self._desk, self._t, self._at = desk, t, desk.root
         self._field = ui.input(t("home.path"), value=str(self._at)).classes("w-full")
         self._field.on("keydown.enter", lambda: self._go(Path(self._field.value).expanduser()))
@@ -91,7 +79,7 @@ class _FolderChoice:
         try:
             inside = subfolders(self._at)
         except KinefitError as error:
-            show_error(t, error)
+            s.show_error(t, error)
             inside = []
         files = openable_files(self._at)
         with ui.scroll_area().classes("w-full h-48 border"), ui.list().props("dense").classes("w-full"):
@@ -113,7 +101,7 @@ class _FolderChoice:
         use_folder(self._desk, Path(self._field.value).expanduser())
 
 
-def _drop_area(desk: Desk, t: Texts) -> None:
+def _drop_area(desk: Desk, t: s.Texts) -> None:
     folder = desk.root / f"recording-{time.strftime('%Y%m%d-%H%M%S')}"
     ui.label(t("home.drop_text", folder=folder))
 
@@ -138,17 +126,17 @@ def _drop_area(desk: Desk, t: Texts) -> None:
     ).props("accept='video/*,.mkv,.mts,.m2ts,.mxf'").classes("w-full")  # fmt: skip
 
 
-async def _takes(desk: Desk, t: Texts) -> None:
-    takes = await in_thread(lambda: [(take, take.state) for take in takes_below(desk.root)])
-    if others := await in_thread(lambda root: takes_below(root, addressable=False), desk.root):
-        names = ", ".join(short(take.file.parent, desk.root) for take in others[:_MAX_NAMES])
+async def _takes(desk: Desk, t: s.Texts) -> None:
+    takes = await s.in_thread(lambda: [(take, take.state) for take in takes_below(desk.root)])
+    if others := await s.in_thread(lambda root: takes_below(root, addressable=False), desk.root):
+        names = ", ".join(s.short(take.file.parent, desk.root) for take in others[:_MAX_NAMES])
         ui.label(t("home.session_unnamed", count=len(others), names=names))
     if not takes:
         ui.label(t("home.session_none"))
     for take, state in takes:
         job = desk.jobs.open(take.file)
         with ui.row().classes("items-center w-full"):
-            ui.link(short(take.file.parent, desk.root), link("/take", path=take.file)).classes("flex-1")
+            ui.link(s.short(take.file.parent, desk.root), s.link("/take", path=take.file)).classes("flex-1")
             ui.label(t(f"state.{job.state if job else state}"))
     if takes:
         ui.link(t("home.session"), "/session")
@@ -163,11 +151,8 @@ _LINK = '<q-td :props="props"><a :href="props.row.page" class="text-primary">{{ 
 
 async def session_page(desk: Desk) -> None:
     """Build the page."""
-    t = texts()
-    with shell(desk, t, t("session.title", folder=desk.root)):
-        if desk.hide_faces is None:
-            ui.navigate.to("/")
-            return
+    t = s.texts()
+    with s.shell(desk, t, t("session.title", folder=desk.root)):
         columns = [
             {"name": key, "label": t(f"session.{key}"), "field": key, "sortable": True,
              "align": "left" if key in _TEXTS else "right"} for key in (*_TEXTS, *_NUMBERS)
@@ -183,7 +168,7 @@ async def session_page(desk: Desk) -> None:
         ui.label(t("session.agreement_text")).classes("text-sm")
 
         async def look() -> None:
-            rows = [_row(desk, t, found) for found in await in_thread(recordings, desk.root)]
+            rows = [_row(desk, t, found) for found in await s.in_thread(recordings, desk.root)]
             if rows != table.rows:
                 table.rows = rows
             table.props["no-data-label"] = t("home.session_none")
@@ -191,13 +176,13 @@ async def session_page(desk: Desk) -> None:
         ui.timer(_REFRESH_S, look)
 
 
-def _row(desk: Desk, t: Texts, found: SessionRow) -> dict[str, Any]:
+def _row(desk: Desk, t: s.Texts, found: SessionRow) -> dict[str, Any]:
     """A row of the table: texts, and numbers, by which it is sorted."""
     file = found.take.file
-    name = short(file.parent if file.name == "take.toml" else file, desk.root)
+    name = s.short(file.parent if file.name == "take.toml" else file, desk.root)
     return {
         "key": f"{file} {found.person}", "file": str(file), "folder": str(found.folder or ""),
-        "page": desk.prefix + link("/take", path=file),
+        "page": desk.prefix + s.link("/take", path=file),
         "take": t("session.of_person", name=name, number=found.person) if found.person else name,
         **{key: found.session.get(key, "") for key in ("subject", "date", "movement")},
         "state": found.problem or _state(desk, t, found),
@@ -206,7 +191,7 @@ def _row(desk: Desk, t: Texts, found: SessionRow) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _state(desk: Desk, t: Texts, found: SessionRow) -> str:
+def _state(desk: Desk, t: s.Texts, found: SessionRow) -> str:
     """That of the last job of the take unless it is done, else that of its files."""
     job = next((job for job in reversed(desk.jobs.jobs) if job.take == found.take.file and job.state != DONE), None)
     if job is None:
@@ -215,20 +200,20 @@ def _state(desk: Desk, t: Texts, found: SessionRow) -> str:
     return t(f"state.{job.state}") + "".join(f" {100 * done:.0f} %" for done in share)
 
 
-def _compute(desk: Desk, t: Texts, table: ui.table) -> None:
+def _compute(desk: Desk, t: s.Texts, table: ui.table) -> None:
     if not table.selected:
         ui.notify(t("session.none"), type="warning")
     for file in dict.fromkeys(row["file"] for row in table.selected):
         desk.start(Path(file), "track", file, "--json")
 
 
-def _compare(t: Texts, table: ui.table) -> None:
+def _compare(t: s.Texts, table: ui.table) -> None:
     keys = {row["key"] for row in table.selected}
     chosen = sorted((row for row in table.rows if row["key"] in keys), key=lambda row: row["date"])
     if len(chosen) != 2 or not all(row["folder"] for row in chosen):
         ui.notify(t("session.two"), type="warning")
         return
-    ui.navigate.to(link("/compare", a=chosen[0]["folder"], b=chosen[1]["folder"]))
+    ui.navigate.to(s.link("/compare", a=chosen[0]["folder"], b=chosen[1]["folder"]))
 
 
 _MAX_POINTS = 2000  # of a curve
@@ -236,29 +221,26 @@ _MAX_POINTS = 2000  # of a curve
 
 async def compare_page(desk: Desk, before: Path, after: Path) -> None:
     """Build the page of two folders of results."""
-    t = texts()
-    with shell(desk, t, t("compare.title")):
-        if desk.hide_faces is None:
-            ui.navigate.to("/")
-            return
-        names = t("compare.before", name=short(before, desk.root)), t("compare.after", name=short(after, desk.root))
+    t = s.texts()
+    with s.shell(desk, t, t("compare.title")):
+        names = t("compare.before", name=s.short(before, desk.root)), t("compare.after", name=s.short(after, desk.root))
         with ui.row().classes("items-center"):
             for name in names:
                 ui.label(name).classes("break-all")
-            to = link("/compare", a=after, b=before)
+            to = s.link("/compare", a=after, b=before)
             ui.button(t("compare.swap"), icon="swap_horiz", on_click=lambda: ui.navigate.to(to)).props("flat")
-        both = await loaded(t, t("compare.loading"), desk.comparison, before, after)
+        both = await s.loaded(t, t("compare.loading"), desk.comparison, before, after)
         if both is None:
             return
-        with card(t("compare.scene")):
-            page_frame(both.scene.address, t("compare.scene")).classes("w-full h-[32rem] border")
-        with card(t("compare.angle")):
+        with s.card(t("compare.scene")):
+            s.page_frame(both.scene.address, t("compare.scene")).classes("w-full h-[32rem] border")
+        with s.card(t("compare.angle")):
             _angles(t, both, names)
-        with card(t("compare.ranges")):
+        with s.card(t("compare.ranges")):
             _ranges(t, both)
 
 
-def _angles(t: Texts, both: Comparison, names: tuple[str, str]) -> None:
+def _angles(t: s.Texts, both: Comparison, names: tuple[str, str]) -> None:
     """A choice of an angle, and its two curves from the first frame of each on."""
 
     def draw() -> None:
@@ -282,7 +264,7 @@ def _angles(t: Texts, both: Comparison, names: tuple[str, str]) -> None:
     draw()
 
 
-def _ranges(t: Texts, both: Comparison) -> None:
+def _ranges(t: s.Texts, both: Comparison) -> None:
     ui.label(t("compare.ranges_text")).classes("text-sm")
     columns = [t(f"compare.{key}") for key in ("angle", "range_before", "range_after", "change")]
     rows = ((of.angle, of.before, of.after, "● " * of.is_clear + of.change) for of in both.ranges)

@@ -9,13 +9,11 @@ from pathlib import Path
 from nicegui import ui
 
 from kinefit.errors import KinefitError
+from kinefit.studio.app import live
 from kinefit.studio.app.desk import Desk
 from kinefit.studio.app.jobs import FAILED, Job
-from kinefit.studio.app.live import followable, found_cameras, is_up, page_of, recorded_take, start_live
-from kinefit.studio.app.pages.shell import card, in_thread, link, notified, page_frame, shell, short, show_error, texts
+from kinefit.studio.app.pages import shell as s
 from kinefit.studio.app.people import jpeg, unrecognisable
-from kinefit.studio.app.texts import Texts
-from kinefit.studio.app.webcams import Recorder, Webcam, find_webcams, write_live_take
 
 _REFRESH_S = 0.5  # between two looks at the session
 _PREVIEW_PX = 240
@@ -23,26 +21,23 @@ _PREVIEW_PX = 240
 
 async def live_page(desk: Desk) -> None:
     """Build the page."""
-    t = texts()
-    with shell(desk, t, t("live.title")):
-        if desk.hide_faces is None:
-            ui.navigate.to("/")
-            return
+    t = s.texts()
+    with s.shell(desk, t, t("live.title")):
         await ui.context.client.connected()
-        _LivePage(desk, t, await in_thread(followable, desk.root))
+        _LivePage(desk, t, await s.in_thread(live.followable, desk.root))
 
 
 class _LivePage:
     """The session and the cameras."""
 
-    def __init__(self, desk: Desk, t: Texts, takes: dict[Path, bool]) -> None:
+    def __init__(self, desk: Desk, t: s.Texts, takes: dict[Path, bool]) -> None:
         self._desk, self._t, self._takes = desk, t, takes
-        self._webcams: list[Webcam] | None = None
+        self._webcams: list[live.Webcam] | None = None
         self._calibrations: list[Path] = []
         self._shown: tuple[object, ...] = ()
         with ui.card().classes("w-full"):
             self._session()
-        with card(t("live.cameras")):
+        with s.card(t("live.cameras")):
             self._cameras()
         ui.timer(_REFRESH_S, self._look)
 
@@ -54,7 +49,7 @@ class _LivePage:
         """Show the session anew if its state changed, and how much is recorded."""
         job = self._job
         was_up = self._shown[:1] == (job,) and self._shown[-1]
-        state = (job, job.state, was_up or await in_thread(is_up, job)) if job else ()
+        state = (job, job.state, was_up or await s.in_thread(live.is_up, job)) if job else ()
         if state != self._shown:
             self._shown = state
             self._session.refresh()
@@ -65,9 +60,9 @@ class _LivePage:
     def _session(self) -> None:
         t, job = self._t, self._job
         if job is not None and job.is_open:
-            ui.label(short(job.take, self._desk.root)).classes("break-all")
+            ui.label(s.short(job.take, self._desk.root)).classes("break-all")
             if self._shown and self._shown[-1]:
-                page_frame(page_of(job), t("live.page")).classes("w-full h-[36rem] border")
+                s.page_frame(live.page_of(job), t("live.page")).classes("w-full h-[36rem] border")
             else:
                 ui.label(t("live.starting"))
             ui.button(t("live.stop"), icon="stop", on_click=job.pause)
@@ -78,7 +73,7 @@ class _LivePage:
             ui.label(t("live.no_takes"))
             return
         names = {
-            str(file): t("live.stream" if streams else "live.replay", name=short(file, self._desk.root))
+            str(file): t("live.stream" if streams else "live.replay", name=s.short(file, self._desk.root))
             for file, streams in self._takes.items()
         }
         choice = ui.select(names, value=next(iter(names)), label=t("live.take")).classes("w-full max-w-xl")
@@ -87,16 +82,16 @@ class _LivePage:
     def _ended(self, job: Job) -> None:
         t = self._t
         if job.state == FAILED and job.error is not None:
-            show_error(t, job.error)
+            s.show_error(t, job.error)
             return
         ui.label(t("live.ended"))
         for line in job.printed.splitlines()[1:]:  # behind the address of the page
             ui.label(line).classes("text-sm text-grey-8 break-all")
-        if take := recorded_take(job):
-            ui.link(t("live.recorded"), link("/take", path=take))
+        if take := live.recorded_take(job):
+            ui.link(t("live.recorded"), s.link("/take", path=take))
 
     def _start(self, take: Path) -> None:
-        start_live(self._desk.jobs, take)
+        live.start_live(self._desk.jobs, take)
 
     @ui.refreshable_method
     def _cameras(self) -> None:
@@ -117,12 +112,13 @@ class _LivePage:
             for webcam in self._webcams:
                 with ui.column().classes("gap-0"):
                     image = unrecognisable(webcam.image) if self._desk.hide_faces else webcam.image
-                    preview = ui.image(_data(jpeg(image, _PREVIEW_PX))).classes("w-60")
+                    data = b64encode(jpeg(image, _PREVIEW_PX)).decode()
+                    preview = ui.image(f"data:image/jpeg;base64,{data}").classes("w-60")
                     preview.props["alt"] = webcam.name
                     boxes[webcam.number] = ui.checkbox(webcam.name, value=True)
         ui.label(t("live.one_alone"))
         places = {"": t("live.no_calibration")}
-        places |= {str(file): short(file, self._desk.root) for file in self._calibrations}
+        places |= {str(file): s.short(file, self._desk.root) for file in self._calibrations}
         where = ui.select(places, value="", label=t("live.calibration")).classes("w-full max-w-xl")
 
         def chosen() -> dict[int, tuple[int, int]]:
@@ -136,25 +132,25 @@ class _LivePage:
 
     async def _find(self) -> None:
         ui.notify(self._t("live.finding"))
-        self._webcams = await in_thread(find_webcams)
-        self._calibrations = await in_thread(found_cameras, self._desk.root)
+        self._webcams = await s.in_thread(live.find_webcams)
+        self._calibrations = await s.in_thread(live.found_cameras, self._desk.root)
         self._cameras.refresh()
 
     def _use(self, sizes: dict[int, tuple[int, int]], calibration: str) -> None:
         if not sizes or (len(sizes) > 1 and not calibration):
             ui.notify(self._t("live.needs_calibration" if sizes else "live.choose"), type="warning")
             return
-        with notified():
-            self._start(write_live_take(self._desk.root, sizes, Path(calibration) if calibration else None))
+        with s.notified():
+            self._start(live.write_live_take(self._desk.root, sizes, Path(calibration) if calibration else None))
 
     async def _record(self, sizes: dict[int, tuple[int, int]]) -> None:
         if not sizes:
             ui.notify(self._t("live.choose"), type="warning")
             return
         folder = self._desk.root / f"walk-{time.strftime('%Y%m%d-%H%M%S')}"
-        with notified():
-            take = await in_thread(write_live_take, self._desk.root, sizes)
-            self._desk.recorder = await in_thread(Recorder, take, folder)
+        with s.notified():
+            take = await s.in_thread(live.write_live_take, self._desk.root, sizes)
+            self._desk.recorder = await s.in_thread(live.Recorder, take, folder)
         self._cameras.refresh()
 
     def _said(self) -> str:
@@ -167,12 +163,7 @@ class _LivePage:
             return
         ui.notify(self._t("live.writing"))
         try:
-            ui.navigate.to(link("/take", path=await in_thread(recorder.stop)))
+            ui.navigate.to(s.link("/take", path=await s.in_thread(recorder.stop)))
         except (KinefitError, OSError) as error:
             ui.notify(str(error), type="negative", timeout=0, close_button=True)
             self._cameras.refresh()
-
-
-def _data(content: bytes) -> str:
-    """A JPEG as an address that holds it."""
-    return f"data:image/jpeg;base64,{b64encode(content).decode()}"

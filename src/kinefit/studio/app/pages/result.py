@@ -17,22 +17,10 @@ from kinefit.exporters.report.moments import Moment, doubtful_moments
 from kinefit.exporters.tables import spoken
 from kinefit.fitting.initialization.from_points import clickable
 from kinefit.studio.app.desk import Desk
-from kinefit.studio.app.pages.shell import (
-    COLOURS,
-    card,
-    in_thread,
-    link,
-    loaded,
-    notified,
-    page_frame,
-    shell,
-    show_error,
-    texts,
-)
+from kinefit.studio.app.pages import shell as s
 from kinefit.studio.app.review import Review
-from kinefit.studio.app.texts import Texts
 from kinefit.takes.batch import corrections
-from kinefit.takes.batch.inputs import is_outdated
+from kinefit.takes.batch.corrections import is_outdated
 from kinefit.takes.batch.results import FORMATS, description, write_format
 
 _REFRESH_S = 0.1  # between two looks at the clock of the 3D figure
@@ -43,12 +31,9 @@ _MAX_POINTS = 2000  # of a curve
 
 async def result_page(desk: Desk, take: Path, folder: Path) -> None:
     """Build the page of one person's result."""
-    t = texts()
-    with shell(desk, t, t("result.title", name=take.parent.name)):
-        if desk.hide_faces is None:
-            ui.navigate.to("/")
-            return
-        review = await loaded(t, t("result.loading"), desk.review, take, folder)
+    t = s.texts()
+    with s.shell(desk, t, t("result.title", name=take.parent.name)):
+        review = await s.loaded(t, t("result.loading"), desk.review, take, folder)
         if review is not None:
             _ResultPage(desk, t, take, review)
 
@@ -56,7 +41,7 @@ async def result_page(desk: Desk, take: Path, folder: Path) -> None:
 class _ResultPage:
     """The parts of the page."""
 
-    def __init__(self, desk: Desk, t: Texts, take: Path, review: Review) -> None:
+    def __init__(self, desk: Desk, t: s.Texts, take: Path, review: Review) -> None:
         self._desk, self._t, self._take, self._review = desk, t, take, review
         self._shown = -1
         self._range: list[int | None] = [None, None]
@@ -67,7 +52,7 @@ class _ResultPage:
             ui.label(t("result.other_cameras")).props('role="alert"')
         self._time_line()
         with ui.row().classes("w-full items-stretch"):
-            page_frame(review.scene.address, "3D").classes("flex-1 min-w-[320px] min-h-[26rem] border")
+            s.page_frame(review.scene.address, "3D").classes("flex-1 min-w-[320px] min-h-[26rem] border")
             wide = "flex-1 min-w-[320px]" if len(review.cameras) < 2 else "w-full"
             with ui.row().classes(f"{wide} content-start gap-1"):
                 for camera in review.cameras:
@@ -81,15 +66,15 @@ class _ResultPage:
                         joints = list(dict.fromkeys((*clickable(motion.body), *motion.body.landmarks.names)))
                         self._joint = ui.select(joints, label=t("result.joint"), with_input=True, clearable=True)
                         self._joint.classes("w-48")
-        with card(t("result.ranges")):
+        with s.card(t("result.ranges")):
             ui.label(t("result.ranges_text")).classes("text-sm")
             columns = ("range_of", "left", "right", "middle", "difference")
             text_table([t(f"result.{key}") for key in columns], review.ranges)
             for name in ("report", "gait"):
                 if (page := review.folder / f"{name}.html").is_file():
                     desk.files.folders.add(review.folder)
-                    ui.link(t(f"take.{name}"), link("/file", path=page), new_tab=True)
-        with card(t("result.angle")):
+                    ui.link(t(f"take.{name}"), s.link("/file", path=page), new_tab=True)
+        with s.card(t("result.angle")):
             names = {name: spoken(name) for name in motion.body.tree.coordinates}
             first = next((name for name in names if name.startswith("knee_angle")), next(iter(names)))
             self._angle = ui.select(names, value=first, with_input=True, on_change=lambda: self._draw_angle())
@@ -97,9 +82,9 @@ class _ResultPage:
             self._chart = ui.echart({}, on_point_click=lambda event: self._go(event.data_index * self._step))
             self._chart.classes("w-full h-56")
             self._draw_angle()
-        with card(t("result.corrections_title")):
+        with s.card(t("result.corrections_title")):
             self._corrections()
-        with card(t("result.export_title")):
+        with s.card(t("result.export_title")):
             self._export()
         self._follow()
         ui.timer(_REFRESH_S, self._follow)
@@ -120,7 +105,7 @@ class _ResultPage:
         marks = "".join(
             f'<span title="{escape(" ".join(m.what))}" style="position:absolute;height:8px;'
             f'left:{100 * m.start / last:.2f}%;width:max(3px,{100 * (m.stop - m.start) / last:.2f}%);'
-            f'background:{to_hex(COLOURS["fault"])}"></span>'
+            f'background:{to_hex(s.COLOURS["fault"])}"></span>'
             for m in moments
         )
         ui.html(f'<div style="position:relative;height:8px">{marks}</div>', sanitize=False).classes("w-full")
@@ -169,7 +154,7 @@ class _ResultPage:
         )  # fmt: skip
         for camera, image in self._images.items():
             image.set_source(
-                link("/image/frame", folder=self._review.folder, camera=camera, frame=frame, longest=_IMAGE_PX)
+                s.link("/image/frame", folder=self._review.folder, camera=camera, frame=frame, longest=_IMAGE_PX)
             )
         if not clock.playing:
             self._mark_now(frame)
@@ -190,7 +175,7 @@ class _ResultPage:
         self._chart.options.update({
             "animation": False, "grid": {"left": 50, "right": 15, "top": 30, "bottom": 30},
             "tooltip": {"trigger": "axis"},
-            "xAxis": {"type": "category", "data": [round(float(s), 3) for s in motion.times[::step]], "name": "s"},
+            "xAxis": {"type": "category", "data": motion.times[::step].round(3).tolist(), "name": "s"},
             "yAxis": {"type": "value", "scale": True, "name": self._t("result.angles_unit")},
             "series": [
                 {**line, "name": spoken(name), "data": _numbers(value), "markLine": _mark(0)},
@@ -236,7 +221,7 @@ class _ResultPage:
         try:
             made = corrections.corrections_of(self._take)
         except KinefitError as error:
-            show_error(t, error)
+            s.show_error(t, error)
             made = ()
         if is_outdated(self._review.motion.provenance, self._take):
             ui.label(t("take.outdated")).props('role="alert"')
@@ -252,7 +237,7 @@ class _ResultPage:
 
     def _again(self) -> None:
         self._desk.start(self._take, "track", str(self._take), "--json")
-        ui.navigate.to(link("/take", path=self._take))
+        ui.navigate.to(s.link("/take", path=self._take))
 
     def _set_range(self, end: int) -> None:
         self._range[end] = self._review.scene.player.clock.frame
@@ -278,7 +263,7 @@ class _ResultPage:
         return round(float(self._review.motion.times[frame]) * self._review.seen.rate)
 
     def _edit(self, edit: Callable[..., object], *arguments: Any) -> None:
-        with notified():
+        with s.notified():
             edit(*arguments)
         self._list.refresh()
 
@@ -305,9 +290,9 @@ class _ResultPage:
         t = self._t
 
         async def write(format: str) -> None:
-            with notified():
+            with s.notified():
                 file = self._review.folder / FORMATS.get(format).file
-                await in_thread(write_format, self._review.motion, format, file)
+                await s.in_thread(write_format, self._review.motion, format, file)
                 ui.notify(t("result.export_done", file=file), type="positive", timeout=10_000)
 
         with ui.row():
@@ -330,5 +315,5 @@ def _numbers(values: np.ndarray) -> list[float | None]:
 
 
 def _mark(index: int) -> dict[str, Any]:
-    line = {"color": to_hex(COLOURS["fault"]), "type": "solid"}
+    line = {"color": to_hex(s.COLOURS["fault"]), "type": "solid"}
     return {"symbol": "none", "silent": True, "label": {"show": False}, "lineStyle": line, "data": [{"xAxis": index}]}

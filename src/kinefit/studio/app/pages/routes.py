@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import numpy as np
@@ -26,64 +26,70 @@ _THUMBNAIL_PX = 384
 def add_pages(desk: Desk) -> None:
     """Register all pages of a desk with NiceGUI's application."""
 
+    async def asked(page: Callable[..., Awaitable[None]], *arguments: object) -> None:
+        """A page; where nobody has said yet whether faces are shown, the first one, which asks for it."""
+        if desk.hide_faces is None:
+            ui.navigate.to("/")
+        else:
+            await page(desk, *arguments)
+
     @ui.page("/")
     async def home() -> None:
         await home_page(desk)
 
     @ui.page("/take")
     async def take(path: str) -> None:
-        await take_page(desk, path)
+        await asked(take_page, path)
 
     @ui.page("/result")
     async def result(path: str, folder: str) -> None:
-        await result_page(desk, Path(path), Path(folder))
+        await asked(result_page, Path(path), Path(folder))
 
     @ui.page("/session")
     async def session() -> None:
-        await session_page(desk)
+        await asked(session_page)
 
     @ui.page("/compare")
     async def compare(a: str, b: str) -> None:
-        await compare_page(desk, Path(a), Path(b))
+        await asked(compare_page, Path(a), Path(b))
 
     @ui.page("/live")
     async def live() -> None:
-        await live_page(desk)
+        await asked(live_page)
 
-    def of_video(read: Callable[[], NDArray[np.uint8]]) -> Response:
-        """What `read` gives, unrecognisable where faces are hidden."""
+    def shown(read: Callable[[], NDArray[np.uint8] | None], longest: int = _THUMBNAIL_PX) -> Response:
+        """The image that `read` gives."""
         if desk.hide_faces is None:
             return Response(status_code=403)
         try:
-            image = read()
+            image, problem = read(), ""
         except KinefitError as error:
-            return Response(str(error), status_code=404)
-        return _image(jpeg(unrecognisable(image) if desk.hide_faces else image, _THUMBNAIL_PX))
+            image, problem = None, str(error)
+        if image is None:
+            return Response(problem, status_code=404)
+        headers = {"Cache-Control": "no-store"}
+        return Response(jpeg(image, longest), media_type="image/jpeg", headers=headers)
+
+    def hidden(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The image, unrecognisable where faces are hidden."""
+        return unrecognisable(image) if desk.hide_faces else image
 
     @app.get("/image/first")
     def first(path: str) -> Response:
-        return of_video(lambda: first_image(Path(path)))
+        return shown(lambda: hidden(first_image(Path(path))))
 
     @app.get("/image/raw")
     def raw(path: str, share: float, start: float = 0.0, stop: float | None = None) -> Response:
-        return of_video(lambda: image_at(Path(path), share, start=start, stop=stop))
+        return shown(lambda: hidden(image_at(Path(path), share, start=start, stop=stop)))
 
     @app.get("/image/person")
     def person(path: str, number: int) -> Response:
-        if desk.hide_faces is None:
-            return Response(status_code=403)
-        image = desk.people.known(Path(path), number, hide_faces=desk.hide_faces)
-        return Response(status_code=404) if image is None else _image(jpeg(image, _THUMBNAIL_PX))
+        return shown(lambda: desk.people.known(Path(path), number, hide_faces=bool(desk.hide_faces)))
 
     @app.get("/image/frame")
     def frame(folder: str, camera: str, frame: int, longest: int = 640) -> Response:
         review = desk.opened(Path(folder))
-        if desk.hide_faces is None or review is None:
-            return Response(status_code=403)
-        try:
-            return _image(jpeg(review.image(camera, frame), longest))
-        except KinefitError as error:
-            return Response(str(error), status_code=404)
+        return Response(status_code=403) if review is None else shown(lambda: review.image(camera, frame), longest)
 
     @app.get("/file")
     def file(path: str) -> Response:
@@ -91,7 +97,3 @@ def add_pages(desk: Desk) -> None:
             return Response(status_code=403)
         address = desk.files.address(Path(path))
         return Response(status_code=404) if address is None else RedirectResponse(address, status_code=303)
-
-
-def _image(content: bytes) -> Response:
-    return Response(content, media_type="image/jpeg", headers={"Cache-Control": "no-store"})

@@ -20,27 +20,14 @@ from kinefit.readers.take.file import Take, find_take, read_take, takes_in
 from kinefit.studio.app.desk import Desk
 from kinefit.studio.app.folders import NEW, OUTDATED, UNFINISHED, TakeFolder, video_files
 from kinefit.studio.app.jobs import DONE, FAILED, PAUSED, RUNNING, WAITING, Job
-from kinefit.studio.app.pages.shell import (
-    COLOURS,
-    card,
-    in_thread,
-    link,
-    loaded,
-    notified,
-    page_frame,
-    shell,
-    short,
-    show_error,
-    texts,
-)
+from kinefit.studio.app.pages import shell as s
 from kinefit.studio.app.people import PersonPicture
-from kinefit.studio.app.texts import Texts
 from kinefit.takes.batch import corrections
 
 _CARDS_REFRESH_S = 3.0  # between two looks at what is detected
 
 
-def people_cards(desk: Desk, t: Texts, take: Path, who: ui.select) -> None:
+def people_cards(desk: Desk, t: s.Texts, take: Path, who: ui.select) -> None:
     """Pictures that appear below once there are several people; a click writes the choice into the take file.
 
     `who` is the choice by words, which then stands for what the take file says.
@@ -48,7 +35,7 @@ def people_cards(desk: Desk, t: Texts, take: Path, who: ui.select) -> None:
     shown: list[tuple[PersonPicture, ...]] = [()]
 
     def choose(number: int | None) -> None:
-        with notified():
+        with s.notified():
             corrections.choose_person(take, number)
         who.value = ""
         cards.refresh()
@@ -65,7 +52,7 @@ def people_cards(desk: Desk, t: Texts, take: Path, who: ui.select) -> None:
             for picture in pictures:
                 number, said = picture.number, t("people.choose", number=picture.number)
                 with ui.column().classes("gap-1 items-center"):
-                    source = link("/image/person", path=take, number=number)
+                    source = s.link("/image/person", path=take, number=number)
                     image = ui.image(source).classes("w-28 h-40 cursor-pointer").props("fit=contain")
                     image.props["alt"] = said
                     image.on("click", lambda n=number: choose(n))
@@ -75,7 +62,7 @@ def people_cards(desk: Desk, t: Texts, take: Path, who: ui.select) -> None:
             ui.label(t("people.chosen", number=chosen)).classes("text-sm")
 
     async def look() -> None:
-        found = await in_thread(desk.people.of, take, hide_faces=bool(desk.hide_faces))
+        found = await s.in_thread(desk.people.of, take, hide_faces=bool(desk.hide_faces))
         if found is not shown[0] and (found or shown[0]):
             shown[0] = found
             cards.refresh()
@@ -122,7 +109,7 @@ def coming_images(take: Take, job: Job) -> Callable[[], None]:
             return
         camera = videos[int(last[1]) % len(videos)]
         last[:] = now, last[1] + 1
-        source = link("/image/raw", path=camera.video, share=f"{progress.share:.4f}", **_span(take, camera))
+        source = s.link("/image/raw", path=camera.video, share=f"{progress.share:.4f}", **_span(take, camera))
         if camera.name in images:
             images[camera.name].set_source(source)
             return
@@ -154,23 +141,20 @@ _REFINE = {
 
 async def take_page(desk: Desk, path: str) -> None:
     """Build the page of a take file, or of a folder, whose take file is written if the user asked for it."""
-    t, at, guess = texts(), Path(path), None
+    t, at, guess = s.texts(), Path(path), None
     is_asked_for = at in desk.chosen
     desk.chosen.discard(at)
-    with shell(desk, t, short(at, desk.root)):
-        if desk.hide_faces is None:
-            ui.navigate.to("/")
-            return
+    with s.shell(desk, t, s.short(at, desk.root)):
         first_images(at)
         if at.is_dir() and not takes_in(at):
-            guess = await loaded(t, t("take.reading"), guess_take, at)
+            guess = await s.loaded(t, t("take.reading"), guess_take, at)
             if guess is None:
                 return
             if not is_asked_for:
                 ui.label(t("take.no_file", folder=at))
                 ui.button(t("home.use"), icon="folder_open", on_click=lambda: use_folder(desk, at))
                 return
-        opened = await loaded(t, t("take.reading"), opened_take, at, guess)
+        opened = await s.loaded(t, t("take.reading"), opened_take, at, guess)
         if opened is not None:
             file, take, notes = opened
             desk.files.folders.add(file.parent)
@@ -180,7 +164,7 @@ async def take_page(desk: Desk, path: str) -> None:
 def use_folder(desk: Desk, folder: Path) -> None:
     """Open a folder, as the user asked for it: its first take file is written then."""
     desk.chosen.add(folder)
-    ui.navigate.to(link("/take", path=folder))
+    ui.navigate.to(s.link("/take", path=folder))
 
 
 def first_images(path: Path) -> None:
@@ -189,7 +173,7 @@ def first_images(path: Path) -> None:
     with ui.row().classes("w-full"):
         for video in videos:
             with ui.column().classes("gap-0"):
-                image = ui.image(link("/image/first", path=video)).classes("w-48 min-h-[6rem]")
+                image = ui.image(s.link("/image/first", path=video)).classes("w-48 min-h-[6rem]")
                 image.props["alt"] = video.stem
                 ui.label(video.name).classes("text-sm")
 
@@ -211,12 +195,12 @@ def opened_take(path: Path, guess: Guess | None) -> tuple[Path, Take, tuple[Note
 class _TakePage:
     """The parts of the page below the images."""
 
-    def __init__(self, desk: Desk, t: Texts, folder: TakeFolder, take: Take, notes: tuple[Note, ...]) -> None:
+    def __init__(self, desk: Desk, t: s.Texts, folder: TakeFolder, take: Take, notes: tuple[Note, ...]) -> None:
         self._desk, self._t, self._folder, self._take, self._notes = desk, t, folder, take, notes
         self._shown: tuple[object, ...] = ()
         with ui.expansion(t("take.found_title"), value=bool(notes)).classes("w-full"):
             self._found()
-        with card(t("take.person_title")):
+        with s.card(t("take.person_title")):
             self._person()
         with ui.row():
             ui.button(t("take.track"), icon="play_arrow", on_click=self._track)
@@ -231,7 +215,7 @@ class _TakePage:
         for note in self._notes:
             with ui.row().classes("items-center no-wrap"):
                 severity = _CONFIDENCE[note.sure]
-                ui.icon(_ICONS[severity]).style(f"color: {to_hex(COLOURS[severity])}").tooltip(t(f"take.{note.sure}"))
+                ui.icon(_ICONS[severity]).style(f"color: {to_hex(s.COLOURS[severity])}").tooltip(t(f"take.{note.sure}"))
                 ui.label(f"{note.about}: {note.text}").classes("text-sm")
 
     def _person(self) -> None:
@@ -265,7 +249,7 @@ class _TakePage:
         self._check()
 
     def _edit(self, edit: Callable[[], object], said: str) -> None:
-        with notified():
+        with s.notified():
             edit()
             self._take = read_take(self._folder.file)
             ui.notify(said, type="positive")
@@ -309,11 +293,11 @@ class _TakePage:
         jobs = [job for job in self._desk.jobs.jobs if job.take == file]
         for job in jobs:
             if job.state != DONE:
-                with card(f"{t('take.progress_title')}: {t(f'state.{job.state}')}"):
+                with s.card(f"{t('take.progress_title')}: {t(f'state.{job.state}')}"):
                     self._job(job)
         open_jobs = any(job.is_open for job in jobs)
         if not open_jobs and self._folder.state == UNFINISHED and not any(job.state == PAUSED for job in jobs):
-            with card(t("state.unfinished")):
+            with s.card(t("state.unfinished")):
                 ui.label(t("take.paused_text"))
                 self._resume_buttons()
         if self._folder.people and not open_jobs:
@@ -324,7 +308,7 @@ class _TakePage:
         if job.state == WAITING:
             before = next((other for other in self._desk.jobs.jobs if other.state == RUNNING), None)
             if before is not None and before is not job:
-                ui.label(t("take.waiting_for", name=short(before.take, self._desk.root)))
+                ui.label(t("take.waiting_for", name=s.short(before.take, self._desk.root)))
         steps = ui.column().classes("w-full gap-1")
         bars: dict[str, tuple[Any, Any]] = {}
 
@@ -345,7 +329,7 @@ class _TakePage:
         for note in job.notes[-_MAX_NOTES:]:
             ui.label(note).classes("text-sm text-grey-8")
         if job.state == FAILED and job.error is not None:
-            show_error(t, job.error)
+            s.show_error(t, job.error)
         if job.is_open:
             ui.button(t("take.pause"), icon="pause", on_click=job.pause).props("outline")
         elif job.state == PAUSED:
@@ -372,10 +356,10 @@ class _TakePage:
         with ui.row():
             for k, folder in enumerate(people, start=1):
                 said = t("take.result") if len(people) == 1 else t("take.result_of", number=k)
-                to = link("/result", path=self._folder.file, folder=folder)
+                to = s.link("/result", path=self._folder.file, folder=folder)
                 ui.button(said, icon="accessibility_new", on_click=lambda to=to: ui.navigate.to(to))
                 if (folder / "report.html").is_file():
-                    ui.link(t("take.report"), link("/file", path=folder / "report.html"), new_tab=True)
+                    ui.link(t("take.report"), s.link("/file", path=folder / "report.html"), new_tab=True)
 
     @ui.refreshable_method
     def _findings(self) -> None:
@@ -384,13 +368,13 @@ class _TakePage:
         if job is None or job.state != DONE or job.result is None:
             return
         t = self._t
-        with card(t("take.check_title")):
+        with s.card(t("take.check_title")):
             shown = [found for found in job.result["findings"] if found["severity"] != "good"]
             if not shown:
                 ui.label(t("take.check_none"))
             for found in shown:
                 with ui.row().classes("items-start no-wrap"):
-                    colour = to_hex(COLOURS[found["severity"]])
+                    colour = to_hex(s.COLOURS[found["severity"]])
                     ui.icon(_ICONS[found["severity"]], size="sm").style(f"color: {colour}")
                     with ui.column().classes("gap-0"):
                         ui.label(found["text"])
@@ -403,14 +387,14 @@ class _TakePage:
             if job.result["refined"]:
                 with ui.row().classes("items-center"):
                     ui.label(t("take.refined", file=job.result["refined"])).classes("break-all")
-                    to = link("/take", path=job.result["refined"])
+                    to = s.link("/take", path=job.result["refined"])
                     ui.button(t("take.use_refined"), on_click=lambda: ui.navigate.to(to))
-            page = link("/file", path=self._folder.check_page)
-            page_frame(f"{self._desk.prefix}{page}", t("take.check_page")).classes("w-full h-[36rem] border")
+            page = s.link("/file", path=self._folder.check_page)
+            s.page_frame(f"{self._desk.prefix}{page}", t("take.check_page")).classes("w-full h-[36rem] border")
             ui.link(t("take.check_page"), page, new_tab=True)
 
 
-def _time_left(t: Texts, seconds: float) -> str:
+def _time_left(t: s.Texts, seconds: float) -> str:
     if seconds < 90:
         return t("take.left_seconds", seconds=max(1, round(seconds)))
     return t("take.left", minutes=round(seconds / 60))

@@ -30,6 +30,7 @@ from kinefit.exporters.report.page import inline_policy
 from kinefit.exporters.skeletons.common import Rest, rest_pose
 from kinefit.geometry import se3
 from kinefit.studio.live.packets import Answer, PosePacket
+from kinefit.studio.live.record import written
 from kinefit.studio.serving.access import APP_PAGES, Access
 from kinefit.studio.serving.server import Connection, Page, PageServer
 
@@ -315,11 +316,8 @@ class JsonLines:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        try:
+        with written(self.path, "Give another file with --json."):
             self._file: BinaryIO = sys.stdout.buffer if str(path) == "-" else open(self.path, "wb")
-        except OSError as error:
-            problem = f"cannot be written ({error.strerror})"
-            raise ExportError(problem, file=self.path, remedy="Give another file with --json.") from error
 
     def hello(self, body: Body, packet: bytes) -> None:
         """Write the packet of a new body as one line."""
@@ -335,12 +333,9 @@ class JsonLines:
             self._file.close()
 
     def _write(self, packet: bytes) -> None:
-        try:
+        with written(self.path, "Free some space, or give another --json."):
             self._file.write(packet + b"\n")
             self._file.flush()
-        except OSError as error:
-            problem = f"cannot be written ({error.strerror})"
-            raise ExportError(problem, file=self.path, remedy="Free some space, or give another --json.") from error
 
 
 class Lsl:

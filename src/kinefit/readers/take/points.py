@@ -1,18 +1,57 @@
-"""Face and hands of a take by the colour of the skin: `[[keypoints]]` with format = "skin"."""
+"""Points of a take that no file of a detector has: joints that were clicked, face and hands by the colour of the skin.
+
+The latter are a `[[keypoints]]` with format = "skin".
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import TakeError
+from kinefit.errors import TakeError, choices
 from kinefit.geometry.camera import ImageFrame
 from kinefit.images.detectors.skin import LANDMARKS, WRISTS, SkinTracker, face_box
-from kinefit.observations import KeypointVideo
+from kinefit.observations import ClickVideo, KeypointVideo
+from kinefit.readers.landmarks.annotations import read_clicks
 from kinefit.readers.landmarks.detections import detections_file, read_detections
-from kinefit.readers.take.cameras import TakeCameras
+from kinefit.readers.take.cameras import TakeCameras, stated_rate
 from kinefit.readers.take.entries import KeypointsEntry, Take
 from kinefit.readers.videos.video import Video
+
+_CLICK_CROSS_PX = 20.0  # from a click to the ends of the two lines that cross there: short, that no lens bends them
+
+
+def load_clicks(cameras: TakeCameras) -> tuple[ClickVideo, ...]:
+    """Joints that were clicked: each is two image lines that cross in it, along u and v, with its landmark on both.
+
+    Raises
+    ------
+    TakeError
+        Nothing states the rate; a camera that the take does not have.
+    FileError
+        As `read_clicks`.
+    """
+    take, images, out = cameras.take, cameras.images, list[ClickVideo]()
+    if take.clicks is None:
+        return ()
+    steps = read_clicks(take.clicks)
+    for camera in dict.fromkeys(camera for of in steps for camera in of.points):
+        if camera not in images:
+            problem = choices("camera", camera, images)
+            raise TakeError(problem, file=take.clicks, place="[start] clicks", remedy="Remove its clicks.")
+        rate = stated_rate(cameras.fastest, take.path)
+        mine = [of for of in steps if of.points.get(camera)]
+        names = tuple(dict.fromkeys(name for of in mine for name in of.points[camera]))
+        uv = np.array([[of.points[camera].get(name, (np.nan, np.nan)) for name in names] for of in mine])
+        cross = _CLICK_CROSS_PX * np.array([[[0, -1], [0, 1]], [[-1, 0], [1, 0]]])
+        ends = images[camera].to_calibration(uv[:, :, None, None] + cross).reshape(len(mine), -1, 2, 2)
+        offset = cameras.offset(camera)
+        times = offset + np.array([round(of.step - offset * rate) for of in mine]) / rate
+        titles = tuple(f"{name} {axis}" for name in names for axis in "uv")
+        landmarks = tuple((name,) for name in names for _ in "uv")
+        out.append(ClickVideo(camera, rate, times, titles, landmarks, ends, source=str(take.clicks)))
+    return tuple(out)
+
 
 _NAMES = {"HANDS": LANDMARKS, "WRISTS": WRISTS}
 
