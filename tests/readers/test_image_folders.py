@@ -9,7 +9,7 @@ import pytest
 from kinefit.errors import FileError, ObservationError
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.videos.video import Video, VideoSet
+from kinefit.readers.videos.video import Video
 
 
 def draw(folder, numbers, ending=".png", size=(48, 32)):
@@ -85,13 +85,6 @@ def test_what_is_wrong_with_images_is_told(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileError, match="no images here"):
         Video(tmp_path / "empty", rate=30.0)
-
-
-def test_folders_go_in_step(tmp_path):
-    paths = {name: draw(tmp_path / name, range(6)) for name in ("a", "b")}
-    with VideoSet(paths, {"b": 0.1}, rate=20.0, frames=(2, 6)) as videos:
-        at = videos.read(0)
-        assert (at["a"][0, 0, 0], at["b"][0, 0, 0]) == (10, 0)
 
 
 def test_a_take_of_folders_has_the_rate_of_the_take(tmp_path):
