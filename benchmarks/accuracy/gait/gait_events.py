@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, data, figure
 from kinefit.bodies.motion import Motion
-from kinefit.exporters.gait.plates import footfalls
 from kinefit.exporters.report.cycles import find_cycles, gait_numbers
-from kinefit.exporters.report.feet import foot_events
+from kinefit.exporters.report.feet import foot_events, footing
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
 from kinefit.readers.motion import read_motion
@@ -69,7 +68,8 @@ def run() -> None:
         for event in _own(markers):
             own[event.kind].append((_after_plate(event, on_plates), missed(motion, event)[0]))
         steps += _steps(motion, markers)
-        found = [(step.side[0], time) for step in footfalls(measured) for time in (step.contact, step.off)]
+        steps_on_plates = found.steps if (found := footing(measured)) else ()
+        found = [(step.side[0], time) for step in steps_on_plates for time in (step.contact, step.off)]
         plated += [
             any(side == event.foot and abs(time - event.time) < _SAME_S for side, time in found)
             for event in on_plates

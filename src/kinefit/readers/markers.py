@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,22 +147,36 @@ def _read_c3d(path: Path, unit: str | None) -> Markers:
     return Markers(
         tuple(_unique(labels)[i] for i in keep), c3d.rate, positions[:, keep], residual=c3d.residual[:, keep] * metres,
         up=up, first_frame=c3d.first_frame, source=str(path),
-        unit=str(unit).strip().lower(), events=_events(c3d),
+        unit=str(unit).strip().lower(), events=_events(c3d, path.name),
         notes=tuple(f"{path.name}: {note}" for note in (*c3d.notes, *forces.notes)), plates=forces.plates,
     )
 
 
-def _events(c3d: C3d) -> tuple[MarkerEvent, ...]:
+def _events(c3d: C3d, source: str) -> tuple[MarkerEvent, ...]:
     """Events of the group EVENT, else of the header, in the order of their times."""
-    times = c3d.parameters.get("EVENT:TIMES")
-    labels, contexts, subjects = (_texts(c3d, f"EVENT:{name}") for name in ("LABELS", "CONTEXTS", "SUBJECTS"))
-    found = [MarkerEvent(label, time) for label, time in c3d.events]
-    if isinstance(times, np.ndarray) and times.dtype.kind == "f" and times.size and times.size % 2 == 0:
-        pairs = times.reshape((2, -1), order="F").astype(float)  # minutes, seconds
-        seconds = 60.0 * pairs[0] + pairs[1]
-        many = [(texts + [""] * len(seconds))[: len(seconds)] for texts in (labels, contexts, subjects)]
-        found = [MarkerEvent(n, float(t), c, s) for n, t, c, s in zip(many[0], seconds, *many[1:], strict=True)]
+    found = [MarkerEvent(label, time, source=source) for label, time in c3d.events]
+    if times := _values(c3d, "EVENT:TIMES", "f"):  # minutes and seconds in turn
+        texts, numbers = ("LABELS", "CONTEXTS", "SUBJECTS", "DESCRIPTIONS"), ("ICON_IDS", "GENERIC_FLAGS")
+        columns = [_texts(c3d, f"EVENT:{name}") for name in texts]
+        columns += [_values(c3d, f"EVENT:{name}", "iu") for name in numbers]
+        named = dict(zip(("label", "context", "subject", "description", "icon", "flag"), columns))
+        found = [
+            MarkerEvent(**{"label": ""} | {name: of[k] for name, of in named.items() if k < len(of)},
+                        time=60.0 * minutes + seconds, source=source)
+            for k, (minutes, seconds) in enumerate(zip(times[::2], times[1::2]))
+        ]  # fmt: skip
     return tuple(sorted((e for e in found if np.isfinite(e.time)), key=lambda e: e.time))
+
+
+def _values(c3d: C3d, key: str, kinds: str) -> list[Any]:
+    """Numbers of a parameter of types of numpy's kinds, with its continuations, in the order of the file."""
+    found: list[Any] = []
+    for suffix in ("", *map(str, range(2, 100))):
+        values = c3d.parameters.get(key + suffix)
+        if not isinstance(values, np.ndarray) or values.dtype.kind not in kinds:
+            break
+        found += values.ravel(order="F").tolist()
+    return found
 
 
 def _read_trc(path: Path, unit: str | None) -> Markers:

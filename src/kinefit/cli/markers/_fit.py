@@ -271,7 +271,7 @@ def fit_file(
     """
     from kinefit.exporters import write_markers, write_osim, write_trc
     from kinefit.exporters.gait.plates import standing_mass, stood_on
-    from kinefit.exporters.report.feet import plate_faults
+    from kinefit.exporters.report.feet import foot_findings
     from kinefit.exporters.report.report import write_report
     from kinefit.fitting.markers.sides import label_findings, refuse_wrong_sides
     from kinefit.fitting.markers.subject import fit_marker_subject
@@ -314,7 +314,7 @@ def fit_file(
             motion = replace(motion, plates=stood_on(motion))
         elif options.mass is None:
             motion = motion.with_mass(standing_mass([trial.plates if trial else (), markers.plates], motion.body))
-        findings = [*faults_of(found_labels), *motion_findings(motion, options.height), *plate_faults(motion)]
+        findings = [*faults_of(found_labels), *motion_findings(motion, options.height), *foot_findings(motion)]
         motion = replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings)})
         if notes is not None:
             notes += [*findings, *(f for f in found_labels if f.severity == "note")]

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.masses import segment_masses
 from kinefit.bodies.motion import UP_AXES, Motion
-from kinefit.exporters.gait.plates import GRAVITY, footfalls
+from kinefit.exporters.gait.plates import GRAVITY
 from kinefit.exporters.report import page as p
+from kinefit.exporters.report.feet import footing
 
 PERCENT = np.linspace(0.0, 100.0, 101)
 """Of stance, from contact to toe-off, at which forces are given."""
@@ -38,7 +39,7 @@ def step_forces(motion: Motion) -> list[StepForces]:
     """Forces of all whole steps on the plates of a motion, in the order of their contacts."""
     weight = GRAVITY * float(segment_masses(motion.body).masses.sum())
     up, plates, out = np.array(UP_AXES[motion.up]), {plate.name: plate for plate in motion.plates}, list[StepForces]()
-    for step in footfalls(motion):
+    for step in found.steps if (found := footing(motion)) else ():
         if not np.isfinite([step.contact, step.off]).all():
             continue
         times = step.contact + (step.off - step.contact) * PERCENT / 100.0

@@ -136,5 +136,7 @@ def split_people(markers: Markers) -> dict[str, Markers]:
                 file=markers.source or None, remedy="Name every marker of a person once.",
             )
         residual = None if markers.residual is None else markers.residual[:, indices]
-        out[person] = replace(markers, names=labels, positions=markers.positions[:, indices], residual=residual)
+        own = {"names": labels, "positions": markers.positions[:, indices], "residual": residual}
+        events = tuple(e for e in markers.events if e.subject == person or e.subject not in people)
+        out[person] = replace(markers, **own, events=events)
     return out
