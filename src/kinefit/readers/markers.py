@@ -20,6 +20,7 @@ from kinefit.readers.plates import PlatesRead, read_plates
 from kinefit.readers.plugins import MARKERS, FileFormat
 
 _MAX_NEAR_ORIGIN = 0.01  # [m] from the origin, of a person in metres that are read as millimetres
+_TEXTS_OF_EVENT = ("label", "context", "subject", "description")
 _COMPUTED_POINTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # of a C3D: no positions
 _STATE = 'State it: --unit mm on the command line, unit="mm" from Python, unit = "mm" in a take.'
 _OF_AXIS = re.compile(r"(.+?)[\s_.:(\[-]*([xyz])[)\]]?", re.IGNORECASE)  # a label that is repeated for each axis
@@ -154,17 +155,15 @@ def _read_c3d(path: Path, unit: str | None) -> Markers:
 
 def _events(c3d: C3d, source: str) -> tuple[MarkerEvent, ...]:
     """Events of the group EVENT, else of the header, in the order of their times."""
-    found = [MarkerEvent(label, time, source=source) for label, time in c3d.events]
-    if times := _values(c3d, "EVENT:TIMES", "f"):  # minutes and seconds in turn
-        texts, numbers = ("LABELS", "CONTEXTS", "SUBJECTS", "DESCRIPTIONS"), ("ICON_IDS", "GENERIC_FLAGS")
-        columns = [_texts(c3d, f"EVENT:{name}") for name in texts]
-        columns += [_values(c3d, f"EVENT:{name}", "iu") for name in numbers]
-        named = dict(zip(("label", "context", "subject", "description", "icon", "flag"), columns))
-        found = [
-            MarkerEvent(**{"label": ""} | {name: of[k] for name, of in named.items() if k < len(of)},
-                        time=60.0 * minutes + seconds, source=source)
-            for k, (minutes, seconds) in enumerate(zip(times[::2], times[1::2]))
-        ]  # fmt: skip
+    times, found = _values(c3d, "EVENT:TIMES", "f"), list[MarkerEvent]()  # minutes and seconds in turn
+    if not times:
+        found = [MarkerEvent(label, time, source=source) for label, time in c3d.events]
+    else:
+        columns: dict[str, list[Any]] = {n: _texts(c3d, f"EVENT:{n.upper()}S") for n in _TEXTS_OF_EVENT}
+        columns |= {"icon": _values(c3d, "EVENT:ICON_IDS", "iu"), "flag": _values(c3d, "EVENT:GENERIC_FLAGS", "iu")}
+        for k, (minutes, seconds) in enumerate(zip(times[::2], times[1::2])):
+            known = {"label": ""} | {name: values[k] for name, values in columns.items() if k < len(values)}
+            found.append(MarkerEvent(time=60.0 * minutes + seconds, source=source, **known))  # type: ignore[arg-type]
     return tuple(sorted((e for e in found if np.isfinite(e.time)), key=lambda e: e.time))
 
 

@@ -154,8 +154,9 @@ def _motion(arrays: Mapping[str, NDArray]) -> Motion:
     plates = tuple(ForcePlate(name, **fields_of(arrays, PLATE_SHAPES, sizes, prefix)) for name, prefix in found)
     marked = fields_of(arrays, EVENT_SHAPES, sizes, "events/") if "events/time" in arrays else {}
     events = tuple(MarkerEvent(*one) for one in zip(*(np.asarray(values).tolist() for values in marked.values())))
-    extra = {"lasting": lasting, "plates": plates, "events": events}
-    return Motion(body=body, **own, residuals=residuals, provenance=provenance, **extra)
+    return Motion(
+        body=body, **own, residuals=residuals, provenance=provenance, lasting=lasting, plates=plates, events=events
+    )  # fmt: skip
 
 
 def _residuals(arrays: Mapping[str, NDArray], prefix: str, sizes: dict[str, int]) -> Residuals:

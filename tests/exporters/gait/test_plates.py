@@ -9,7 +9,7 @@ import pytest
 
 from kinefit import load_body, read_markers, read_motion, write_motion
 from kinefit.exporters import write_c3d, write_forces
-from kinefit.exporters.gait.plates import by_plates, footfalls, plate_findings, standing_mass, stood_on
+from kinefit.exporters.gait.plates import by_plates, feet_on_plates, standing_mass, stood_on
 from kinefit.exporters.report.feet import foot_events
 from kinefit.readers.plates import read_force_file
 
@@ -17,6 +17,14 @@ from kinefit.readers.plates import read_force_file
 def events_of(motion):
     feet = foot_events(motion, plates=False)
     return [(foot.contacts, foot.offs) for foot in (feet.left, feet.right)]
+
+
+def footfalls(motion):
+    return feet_on_plates(motion, events_of(motion))[0]
+
+
+def findings_of(motion, events):
+    return feet_on_plates(motion, events)[1]
 
 
 def test_steps_are_those_of_the_plates(walk):
@@ -47,7 +55,7 @@ def test_events_of_plates_replace_those_of_the_feet(walk):
     ],
 )
 def test_a_wrong_plate_is_named(walk, change, text):
-    found = plate_findings(replace(walk, plates=tuple(map(change, walk.plates))), events_of(walk))
+    found = findings_of(replace(walk, plates=tuple(map(change, walk.plates))), events_of(walk))
     if not text:
         assert not found
         return
@@ -57,7 +65,7 @@ def test_a_wrong_plate_is_named(walk, change, text):
 
 def test_nothing_is_said_of_plates_without_feet_or_load(walk):
     empty = replace(walk, plates=tuple(replace(p, force=0.0 * p.force, moment=0.0 * p.moment) for p in walk.plates))
-    assert not footfalls(empty) and not plate_findings(empty, events_of(walk))
+    assert not footfalls(empty) and not findings_of(empty, events_of(walk))
     assert not footfalls(replace(walk, plates=()))
 
 
@@ -147,7 +155,7 @@ def test_events_of_a_late_clock_are_not_used(walk):
 def test_a_plate_elsewhere_has_no_explanation(walk):
     rng = np.random.default_rng(0)
     moved = tuple(replace(p, moment=p.moment + rng.normal(scale=150.0, size=p.moment.shape)) for p in walk.plates)
-    found = plate_findings(replace(walk, plates=moved), events_of(walk))
+    found = findings_of(replace(walk, plates=moved), events_of(walk))
     assert found and all("neither a shift nor a turn" in f.confidence for f in found)
 
 

@@ -165,13 +165,9 @@ def marked_findings(events: Iterable[MarkerEvent], feet: Feet) -> list[Finding]:
     for event in events:
         if (known := foot_event(event)) and (text := _contradiction(event.time, *known, feet)):
             wrong.setdefault(event.source or "the recording", []).append(text)
-    return [
-        Finding(
-            "doubt", "events", f"Events of {file} contradict feet and plates: {'; '.join(texts)}. Those found are used.",
-            (), "Likely: beyond three standard deviations of both.", "Correct the events, or the clock, of that file.",
-        )
-        for file, texts in wrong.items()
-    ]  # fmt: skip
+    text = "Events of {} contradict feet and plates: {}. Those found are used."
+    sure, remedy = "Likely: beyond three standard deviations of both.", "Correct the events or the clock of that file."
+    return [Finding("doubt", "events", text.format(f, "; ".join(of)), (), sure, remedy) for f, of in wrong.items()]
 
 
 def _contradiction(time: float, side: str, kind: str, feet: Feet) -> str:

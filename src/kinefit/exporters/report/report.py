@@ -31,6 +31,7 @@ from kinefit.exporters.report.angles import (
     with_error,
 )
 from kinefit.exporters.report.cycles import Cycles, Norms, find_cycles, gait_numbers
+from kinefit.exporters.report.feet import foot_findings
 from kinefit.exporters.report.figure import figure
 from kinefit.exporters.report.fit import overall_median, point_table, quality_plot, sensor_fits, sensor_table
 from kinefit.exporters.report.flagged import Pictures, flagged, report_frames
@@ -313,8 +314,8 @@ def _cycles(motion: Motion, cycles: Cycles | None, norms: Norms) -> list[p.Html]
     counts = listed([f"{len(s.spans)} {'' if s.name == 'both' else s.name + ' '}cycles" for s in cycles.sides])
     if cycles.kind == "gait":
         text = (
-            f"Gait: {counts}, from contact to contact of a foot (0–100 %). A foot stands while its heel or ball is "
-            "slow over the ground. The dashed vertical line is toe-off. "
+            f"Gait: {counts}, from contact to contact of a foot (0–100 %). A foot stands from where its heel or ball "
+            "gets slow over the ground until its toes leave it. The dashed vertical line is toe-off. "
         )
     else:
         text = f"A repeated movement: {counts}, from one extreme posture to the next of the same kind. "
@@ -324,7 +325,8 @@ def _cycles(motion: Motion, cycles: Cycles | None, norms: Norms) -> list[p.Html]
     )
     if np.isfinite(cycles.likeness):
         text += f" The cycles' coefficient of multiple correlation is {cycles.likeness:.2f}."
-    parts = [p.paragraph(text), gait_table(motion, cycles)]
+    notes = foot_findings(motion) if cycles.kind == "gait" else ()
+    parts = [*(p.callout("note", found.text) for found in notes), p.paragraph(text), gait_table(motion, cycles)]
     if norms:
         parts.append(p.paragraph("The grey band is the normative mean ±1 standard deviation of the table given."))
     return [*parts, p.chooser("Joint", cycle_plots([(motion, cycles)], norms))]
