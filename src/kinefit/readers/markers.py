@@ -20,7 +20,10 @@ from kinefit.readers.plates import PlatesRead, read_plates
 from kinefit.readers.plugins import MARKERS, FileFormat
 
 _MAX_NEAR_ORIGIN = 0.01  # [m] from the origin, of a person in metres that are read as millimetres
-_TEXTS_OF_EVENT = ("label", "context", "subject", "description")
+_OF_EVENT: dict[str, tuple[str, type]] = {
+    "label": ("LABELS", str), "context": ("CONTEXTS", str), "subject": ("SUBJECTS", str),
+    "description": ("DESCRIPTIONS", str), "icon": ("ICON_IDS", int), "flag": ("GENERIC_FLAGS", int),
+}  # fmt: skip
 _COMPUTED_POINTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # of a C3D: no positions
 _STATE = 'State it: --unit mm on the command line, unit="mm" from Python, unit = "mm" in a take.'
 _OF_AXIS = re.compile(r"(.+?)[\s_.:(\[-]*([xyz])[)\]]?", re.IGNORECASE)  # a label that is repeated for each axis
@@ -115,27 +118,27 @@ def _of_one_unit(markers: Markers) -> Markers:
     return markers
 
 
-def _texts(c3d: C3d, key: str) -> list[str]:
-    """A text parameter with its continuations: LABELS, LABELS2 ..."""
-    found: list[str] = []
+def _entries(c3d: C3d, key: str, kind: type = str) -> list[Any]:
+    """Texts or numbers of a parameter with its continuations, in the order of the file: LABELS, LABELS2 ..."""
+    found: list[Any] = []
     for suffix in ("", *map(str, range(2, 100))):
         values = c3d.parameters.get(key + suffix)
-        if not isinstance(values, list):
+        if values is None:
             break
-        found += values
-    return found
+        found += values.ravel(order="F").tolist() if isinstance(values, np.ndarray) else values
+    return [value for value in found if isinstance(value, kind)]
 
 
 def _read_c3d(path: Path, unit: str | None) -> Markers:
     c3d = read_c3d(path)
     count = c3d.points.shape[1]
-    labels = (_texts(c3d, "POINT:LABELS") + [""] * count)[:count]
-    computed = {name for kind in _COMPUTED_POINTS for name in _texts(c3d, f"POINT:{kind}")} - {""}
+    labels = (_entries(c3d, "POINT:LABELS") + [""] * count)[:count]
+    computed = {name for kind in _COMPUTED_POINTS for name in _entries(c3d, f"POINT:{kind}")} - {""}
     keep = [i for i, label in enumerate(labels) if label not in computed]
     if not keep:
         raise ObservationError("all points of this file are computed quantities, none is a marker")
-    screen = "".join(_texts(c3d, "POINT:Y_SCREEN")[:1]).strip().lower().removeprefix("+")
-    unit = unit or next(iter(_texts(c3d, "POINT:UNITS")), None)
+    screen = "".join(_entries(c3d, "POINT:Y_SCREEN")[:1]).strip().lower().removeprefix("+")
+    unit = unit or next(iter(_entries(c3d, "POINT:UNITS")), None)
     metres = _metres(unit)
     if c3d.missing[:, keep].all():
         raise _unseen(len(keep), len(c3d.points))
@@ -155,27 +158,15 @@ def _read_c3d(path: Path, unit: str | None) -> Markers:
 
 def _events(c3d: C3d, source: str) -> tuple[MarkerEvent, ...]:
     """Events of the group EVENT, else of the header, in the order of their times."""
-    times, found = _values(c3d, "EVENT:TIMES", "f"), list[MarkerEvent]()  # minutes and seconds in turn
+    times, found = _entries(c3d, "EVENT:TIMES", float), list[MarkerEvent]()  # minutes and seconds in turn
     if not times:
         found = [MarkerEvent(label, time, source=source) for label, time in c3d.events]
     else:
-        columns: dict[str, list[Any]] = {n: _texts(c3d, f"EVENT:{n.upper()}S") for n in _TEXTS_OF_EVENT}
-        columns |= {"icon": _values(c3d, "EVENT:ICON_IDS", "iu"), "flag": _values(c3d, "EVENT:GENERIC_FLAGS", "iu")}
+        columns = {name: _entries(c3d, f"EVENT:{key}", kind) for name, (key, kind) in _OF_EVENT.items()}
         for k, (minutes, seconds) in enumerate(zip(times[::2], times[1::2])):
             known = {"label": ""} | {name: values[k] for name, values in columns.items() if k < len(values)}
-            found.append(MarkerEvent(time=60.0 * minutes + seconds, source=source, **known))  # type: ignore[arg-type]
+            found.append(MarkerEvent(time=60.0 * minutes + seconds, source=source, **known))
     return tuple(sorted((e for e in found if np.isfinite(e.time)), key=lambda e: e.time))
-
-
-def _values(c3d: C3d, key: str, kinds: str) -> list[Any]:
-    """Numbers of a parameter of types of numpy's kinds, with its continuations, in the order of the file."""
-    found: list[Any] = []
-    for suffix in ("", *map(str, range(2, 100))):
-        values = c3d.parameters.get(key + suffix)
-        if not isinstance(values, np.ndarray) or values.dtype.kind not in kinds:
-            break
-        found += values.ravel(order="F").tolist()
-    return found
 
 
 def _read_trc(path: Path, unit: str | None) -> Markers:

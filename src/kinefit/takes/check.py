@@ -98,12 +98,11 @@ def _feet(c: Checked) -> list[Finding]:
         return []
     entry, markers, trial = c.take.markers[0], seen.markers[0].trimmed(), seen.static_markers[0]
     try:
-        trials = [trial, markers] if trial else [markers]
-        subject = fit_marker_subject(load_body(c.take.body), trials, entry.set, height=c.take.height)
+        body, trials = load_body(c.take.body), [trial, markers] if trial else [markers]
+        subject = fit_marker_subject(body, trials, entry.set, height=c.take.height)
         motion = fit_markers(subject, markers, up=c.take.up, smooth=False)
     except KinefitError as error:
-        text = f"Force plates and events cannot be compared with the feet: {error.problem}."
-        return [Finding("note", "plates", text, remedy=error.remedy or "")]
+        return [finding_of(error)]
     times = motion.times + entry.time_offset
     found = foot_findings(replace(motion, times=times, plates=seen.plates, events=seen.events))
     return [*found] or [Finding("good", "plates", "Force plates and events of the files fit the feet.")]

@@ -310,12 +310,15 @@ def fit_file(
         motion = fit_markers(
             subject, markers, limits=options.limits, up=options.up, smooth=options.smooth, progress=step
         )
+        shared = list[Finding]()
         if len(people) > 1:
-            motion = replace(motion, plates=stood_on(motion))
+            plates, shared = stood_on(motion, [one for name, one in people.items() if name != person])
+            motion = replace(motion, plates=plates)
         elif options.mass is None:
             motion = motion.with_mass(standing_mass([trial.plates if trial else (), markers.plates], motion.body))
-        findings = [*faults_of(found_labels), *motion_findings(motion, options.height), *foot_findings(motion)]
-        motion = replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings)})
+        findings = [*faults_of(found_labels), *motion_findings(motion, options.height), *shared, *foot_findings(motion)]
+        wrong = (found for found in findings if found.severity != "note")
+        motion = replace(motion, provenance={**motion.provenance, FINDINGS: as_records(wrong)})
         if notes is not None:
             notes += [*findings, *(f for f in found_labels if f.severity == "note")]
         files: dict[str, Path] = {}

@@ -16,6 +16,7 @@ from kinefit.bodies.masses import segment_masses
 from kinefit.bodies.motion import Motion
 from kinefit.findings import Finding, listed
 from kinefit.geometry.force_plates import LEAST_LOAD, ForcePlate, total_load
+from kinefit.observations import Markers
 
 FOOT = "heel", "metatarsal_phalanx_1", "metatarsal_phalanx_5"
 """Landmarks of a foot, after "l_" or "r_"."""
@@ -26,6 +27,8 @@ GRAVITY = 9.81
 Events = Sequence[tuple[NDArray, NDArray]]
 """Contacts (N,) and toe-offs (M,) [s] of the left and of the right foot."""
 
+_Late = tuple[float, float, int]
+
 CONTACT_STD_S = 0.003
 """[s] that a load takes to rise to 20 N at the 5 to 10 kN/s of a heel."""
 
@@ -35,6 +38,7 @@ _WHOLE_SHARE = 0.9  # of the time, and of a foot's points, over a plate
 _NEARER = 0.05  # [m] by which the other foot is farther away, so that it is known whose step it is
 _EDGE = 0.03  # [m] beyond a plate's edge: the skin and errors of landmarks
 _MOVING, _STANDING_SHARE = 0.5, 0.2  # [m/s] of a foot that swings past the other; of the time, in which it stands
+_LOW = 0.15  # [m] above a plate: markers of a foot that stands on it
 _PARTLY = "a foot stands partly beside it"
 _MIN_OFFSET, _MAX_CORRECTED = 0.06, 0.04  # [m] from the foot in the median: surely wrong; right once it is corrected
 _FOOT_OFFSET = 0.3  # [m]: about a foot's length beside it, somebody or something else stands there
@@ -83,6 +87,11 @@ class _Loaded:
     speeds: NDArray
 
     @property
+    def span(self) -> tuple[float, float]:
+        """[s] of the first and of the last sample."""
+        return float(self.plate.times[self.first]), float(self.plate.times[self.stop - 1])
+
+    @property
     def offsets(self) -> NDArray:
         """(n, 2, 2) [m] from the nearest point of the line from heel to ball of each foot to the centre of pressure."""
         return self.offsets_of(self.cop)
@@ -95,14 +104,18 @@ class _Loaded:
         return cop[:, None] - heel - np.clip(along, 0.0, 1.3)[..., None] * way  # toes are ahead of the ball
 
     @property
+    def half(self) -> NDArray:
+        """(2,) [m] from the middle of the plate to just beyond its edges."""
+        return 0.5 * np.ptp((self.plate.corners - self.plate.centre) @ self.plate.axes.T, axis=0) + _EDGE
+
+    @property
     def apart(self) -> NDArray:
         """(2,) [m] from the line of each foot to the centre of pressure, the median under full load."""
         return np.asarray(np.median(np.linalg.norm(self.offsets, axis=-1)[self.full], axis=0))
 
     def is_over(self, side: int) -> NDArray:
         """(k, 3) bool: points of a foot that are over the plate, under full load."""
-        half = 0.5 * np.ptp((self.plate.corners - self.plate.centre) @ self.plate.axes.T, axis=0) + _EDGE
-        return np.asarray(np.all(np.abs(self.feet[self.full, side]) < half, axis=-1))
+        return np.asarray(np.all(np.abs(self.feet[self.full, side]) < self.half, axis=-1))
 
     def is_stood_on(self, side: int) -> bool:
         """Whether a foot stands over the plate for a fifth of the time or more."""
@@ -118,9 +131,7 @@ class _Loaded:
         return float(self.plate.times[end - 1] + (LEAST_LOAD - a) / (b - a) / self.plate.rate)
 
 
-def feet_on_plates(
-    motion: Motion, events: Events, belt: NDArray | None = None
-) -> tuple[list[Footfall], list[Finding]]:
+def feet_on_plates(motion: Motion, events: Events, belt: NDArray) -> tuple[list[Footfall], list[Finding]]:
     """Steps of one foot alone on a plate, or on several plates, in the order of their contacts; what is wrong.
 
     That is plates that are moved, turned, late or of another unit, as the feet and the load tell, and loads of no
@@ -130,9 +141,9 @@ def feet_on_plates(
     ----------
     motion : Motion
     events : of the feet alone, as their motion shows them
-    belt : (3,) [m/s] of the ground in the motion's world; default: it lies still
+    belt : (3,) [m/s] of the ground in the motion's world; zero of a floor
     """
-    loaded = list(_loaded(motion, np.zeros(3) if belt is None else belt))
+    loaded = list(_loaded(motion, belt))
     late, (steps, others) = _lateness(loaded, events), _footfalls(loaded)
     weight = GRAVITY * float(segment_masses(motion.body).masses.sum())
     findings = _plate_findings(motion, loaded, late, weight) if loaded else []
@@ -141,31 +152,25 @@ def feet_on_plates(
 
 def _footfalls(loaded: Sequence[_Loaded]) -> tuple[list[Footfall], list[tuple[_Loaded, str]]]:
     """Steps, and the loads that are none, with the reason."""
-    steps: list[tuple[int, float, float, list[_Loaded]]] = []  # side, first and last time under load
-    others = list[tuple[_Loaded, str]]()
-    for one in sorted(loaded, key=lambda one: float(one.plate.times[one.first])):
+    steps, others = list[tuple[int, list[_Loaded]]](), list[tuple[_Loaded, str]]()
+    for one in sorted(loaded, key=lambda one: one.span):
         if isinstance(side := _side(one), str):
             others.append((one, side))
-            continue
-        start, stop = float(one.plate.times[one.first]), float(one.plate.times[one.stop - 1])
-        same = next((k for k, (s, _, last, _) in enumerate(steps) if s == side and start <= last), None)
-        if same is None:
-            steps.append((side, start, stop, [one]))
+        elif same := [parts for s, parts in steps if s == side and one.span[0] <= max(p.span[1] for p in parts)]:
+            same[0].append(one)
         else:
-            _, first, last, parts = steps[same]
-            steps[same] = side, min(first, start), max(last, stop), [*parts, one]
-    whole = [_is_whole(side, parts) for side, _, _, parts in steps]
-    others += [(one, _PARTLY) for (_, _, _, parts), good in zip(steps, whole) if not good for one in parts]
-    return [_footfall(side, parts) for (side, _, _, parts), good in zip(steps, whole) if good], others
+            steps.append((side, [one]))
+    whole = [_is_whole(side, parts) for side, parts in steps]
+    others += [(one, _PARTLY) for (_, parts), good in zip(steps, whole) if not good for one in parts]
+    return [_footfall(side, parts) for (side, parts), good in zip(steps, whole) if good], others
 
 
 def _of_no_foot(others: Sequence[tuple[_Loaded, str]], weight: float) -> list[Finding]:
     """One note for each plate on loads, as those of a step, that are of no single foot; `weight` [N]."""
     said: dict[str, list[str]] = {}
-    for one, why in sorted(others, key=lambda pair: float(pair[0].plate.times[pair[0].first])):
+    for one, why in sorted(others, key=lambda pair: pair[0].span):
         if one.plate.load[one.first : one.stop].max() > _LOADS[0] * weight:
-            start, stop = one.plate.times[[one.first, one.stop - 1]]
-            said.setdefault(one.plate.name, []).append(f"from {start:.2f} to {stop:.2f} s ({why})")
+            said.setdefault(one.plate.name, []).append(f"from {one.span[0]:.2f} to {one.span[1]:.2f} s ({why})")
     text = "The force on {} is given to no foot {}. Contacts and toe-offs there are those of the feet."
     return [Finding("note", "plates", text.format(name, listed(times, 6))) for name, times in said.items()]
 
@@ -179,11 +184,10 @@ def _is_whole(side: int, parts: Sequence[_Loaded]) -> bool:
 
 
 def _footfall(side: int, parts: Sequence[_Loaded]) -> Footfall:
-    """A step with its first contact and its last toe-off."""
-    first = min(parts, key=lambda one: one.plate.times[one.first])
-    last = max(parts, key=lambda one: one.plate.times[one.stop - 1])
+    """A step of loads in the order of their begin, with its first contact and its last toe-off."""
+    last = max(parts, key=lambda one: one.span[1])
     names = ", ".join(dict.fromkeys(one.plate.name for one in parts))
-    return Footfall(names, ("left", "right")[side], first.time_of(first.first), last.time_of(last.stop))
+    return Footfall(names, ("left", "right")[side], parts[0].time_of(parts[0].first), last.time_of(last.stop))
 
 
 def _side(one: _Loaded) -> int | str:
@@ -266,7 +270,7 @@ def by_plates(steps: Sequence[Footfall], side: str, end: str, times: NDArray, st
     return table[:, 0], table[:, 1]
 
 
-def _lateness(loaded: Sequence[_Loaded], events: Events) -> tuple[float, float, int] | None:
+def _lateness(loaded: Sequence[_Loaded], events: Events) -> _Late | None:
     """[s] of the plates' clock beside the motion's, its deviation and the number of events; None if it is right."""
     late = np.array([off for one in loaded for off in _late_events(one, events)])
     spread = 1.48 * float(np.median(np.abs(late - np.median(late)))) if len(late) else np.inf
@@ -275,10 +279,8 @@ def _lateness(loaded: Sequence[_Loaded], events: Events) -> tuple[float, float, 
     return float(np.median(late)), max(spread, 0.012) / float(np.sqrt(len(late))), len(late)
 
 
-def _plate_findings(
-    motion: Motion, loaded: Sequence[_Loaded], late: tuple[float, float, int] | None, weight: float
-) -> list[Finding]:
-    """What is wrong with plates: moved, turned, of another unit or (`_lateness`) late; `weight` [N]."""
+def _plate_findings(motion: Motion, loaded: Sequence[_Loaded], late: _Late | None, weight: float) -> list[Finding]:
+    """What is wrong with plates: moved, turned, of another unit or late; `weight` [N]."""
     out = list[Finding]()
     peak = float(total_load(motion.plates, loaded[0].plate.times).max()) / weight
     if not _LOADS[0] < peak < _LOADS[1] and len(loaded) > 1:
@@ -308,10 +310,26 @@ def _finding(text: str, confidence: str, what: str) -> Finding:
     return Finding("doubt", "plates", text, (), confidence, f"Correct {what}.")
 
 
-def stood_on(motion: Motion) -> tuple[ForcePlate, ...]:
-    """The plates on which this person stands: of a recording of several people."""
-    own = {one.plate.name for one in _loaded(motion, np.zeros(3)) if one.apart.min() < _MAX_OFF}
-    return tuple(plate for plate in motion.plates if plate.name in own)
+def stood_on(motion: Motion, others: Sequence[Markers]) -> tuple[tuple[ForcePlate, ...], list[Finding]]:
+    """The plates that this person of a recording loads alone, and notes on those on which another stands, too.
+
+    `others`: markers of the other people, in the motion's world and by its clock.
+    """
+    loaded = [one for one in _loaded(motion, np.zeros(3)) if one.is_stood_on(0) or one.is_stood_on(1)]
+    shared = dict.fromkeys(one.plate.name for one in loaded if any(_is_shared(one, other) for other in others))
+    own = {one.plate.name for one in loaded} - shared.keys()
+    text = "The force on {} is given to nobody: another person stands there at the same time."
+    notes = [Finding("note", "plates", text.format(name)) for name in shared]
+    return tuple(plate for plate in motion.plates if plate.name in own), notes
+
+
+def _is_shared(one: _Loaded, other: Markers) -> bool:
+    """Whether markers of another person stay low over a plate for a fifth of the time that it is loaded."""
+    x = other.positions - one.plate.centre
+    slow = np.linalg.norm(np.gradient(x, 1.0 / other.rate, axis=0), axis=-1) < _MOVING
+    low = slow & np.all(np.abs(x @ one.plate.axes.T) < one.half, axis=-1) & (np.abs(x @ one.plate.normal) < _LOW)
+    during = (other.times >= one.span[0]) & (other.times <= one.span[1])
+    return bool(during.any() and low[during].any(axis=1).mean() > _STANDING_SHARE)
 
 
 def _misplaced(own: list[_Loaded]) -> tuple[str, str]:
@@ -329,7 +347,8 @@ def _misplaced(own: list[_Loaded]) -> tuple[str, str]:
     good = [how for how, after in found.items() if after < min(_MAX_CORRECTED, _CORRECTED_SHARE * before)]
     name, far = own[0].plate.name, f"its centre of pressure is {100 * before:.0f} cm from the nearest foot"
     if good:
-        return f"{name} is {' or '.join(good)}: {far}.", "Likely: so corrected, each step lies under its foot."
+        sure = "Likely: so corrected, each step lies under its foot; another person on the plate looks the same."
+        return f"{name} is {' or '.join(good)}: {far}.", sure
     if before < _FOOT_OFFSET:
         return "", ""
     return f"{name} does not lie under the feet: {far}.", "Certain; neither a shift nor a turn explains it."

@@ -24,6 +24,7 @@ from kinefit.findings import Finding
 
 LEAST_STEP = 0.12  # share of the stature that a foot travels to and fro at least: shuffling 20 cm strides of an adult
 MIN_STRIDE_S = 0.4  # [s]: sprinters take 0.45 s
+BELT_STD = 0.013  # [m/s] of a belt's velocity: the root mean square in ten walks of four people, as if on a belt
 HEEL, BALL, TOE = "heel", ("metatarsal_phalanx_1", "metatarsal_phalanx_5"), "digit_1"  # of a foot, after "l_", "r_"
 _CONTACT_SHARE, _OFF_SHARE = 0.1, 0.18  # of the swing's highest speed: no error against plates in the mean of five
 # people (HC002D, HC036A and HC050A, the adult and the sprinter of forces_nimblephysics), each of whom counts once
@@ -36,7 +37,7 @@ _LABELS = {"foot strike": "contacts", "heel strike": "contacts", "foot off": "of
 _ROUGH_STD_S = 0.05  # of the extreme place alone, which is 49 ms early
 _WAY_HZ, _SPEED_HZ = 6.0, 12.0  # what is faster is noise: walking has 99 % of its power below 6 Hz (Winter)
 _BEFORE_S, _AFTER_S = 0.1, 0.25  # [s] of the extreme place, within which the event is sought
-_LEAST_BELT = 0.15  # [m/s] of what stands: less is a floor
+_LEAST_BELT, _FLAT_SHARE = 0.15, 0.3  # [m/s] of what stands: less is a floor; of the frames, in which it lies flat
 _LEAST_BACK = 0.2  # [m/s] of a pelvis that moves backwards over the ground
 _MIN_SEEN_SHARE = 0.5  # of the frames in which a leg is measured; with less it has no events
 
@@ -107,14 +108,14 @@ def footing(motion: Motion) -> Footing | None:
     return _FOOTINGS[motion]
 
 
-def foot_events(motion: Motion, *, plates: bool = True) -> Feet | None:
-    """Events of both feet, as `footing` finds them; with `plates` false of what the feet show alone."""
-    found = footing(motion) if plates else _feet_alone(motion)
-    return found.feet if isinstance(found, Footing) else found
+def foot_events(motion: Motion) -> Feet | None:
+    """Events of both feet, as `footing` finds them."""
+    found = footing(motion)
+    return found.feet if found else None
 
 
 def _footing(motion: Motion) -> Footing | None:
-    feet = _feet_alone(motion)
+    feet = feet_alone(motion)
     if feet is None:
         return None
     belt = rotation_between_up(motion.up, "y").T @ [feet.belt[0], 0.0, feet.belt[1]]
@@ -123,7 +124,8 @@ def _footing(motion: Motion) -> Footing | None:
     return Footing(feet, tuple(steps), (*findings, *marked_findings(motion.events, feet)))
 
 
-def _feet_alone(motion: Motion) -> Feet | None:
+def feet_alone(motion: Motion) -> Feet | None:
+    """Events of both feet as they show them alone, without plates; None as in `footing`."""
     names = [f"{s}_{n}" for s in "lr" for n in ("hip", HEEL, *BALL, TOE)]
     if any(name not in motion.body.landmarks.names for name in names) or len(motion) < 3:
         return None
@@ -174,12 +176,10 @@ def _contradiction(time: float, side: str, kind: str, feet: Feet) -> str:
     """How an event of a foot at a time [s] contradicts those found; "" where it does not, or none can be known."""
     foot, other = (feet.left, feet.right) if side == "left" else (feet.right, feet.left)
     both = np.concatenate([foot.contacts, foot.offs])
-    if not len(both) or not both.min() - _AROUND_S < time < both.max() + _AROUND_S:
-        return ""
     times, stds = (foot.contacts, foot.contact_std) if kind == "contacts" else (foot.offs, foot.off_std)
+    if not len(times) or not both.min() - _AROUND_S < time < both.max() + _AROUND_S:
+        return ""
     marked = f"{side} {'contact' if kind == 'contacts' else 'toe-off'} at {time:.3f} s"
-    if not len(times):
-        return f"{marked} (none found)"
     near = int(np.argmin(np.abs(times - time)))
     late, sure = float(times[near] - time), _MARKED_SIGMAS * float(np.hypot(stds[near], _MARKED_STD_S))
     if abs(late) <= sure:
@@ -215,9 +215,9 @@ def _belt(feet: NDArray, velocity: NDArray, pelvis: NDArray, rate: float) -> NDA
     pelvis : (F, 2) [m] along x and z; rate : float [Hz]
     """
     lower = np.argmin(feet[..., 1].mean(axis=2), axis=1)  # of two feet the one that stands
-    frames = np.arange(len(feet))
-    slower = np.argmin(np.linalg.norm(velocity[frames, lower], axis=-1), axis=1)
-    median = np.median(velocity[frames, lower, slower], axis=0)
+    ends = velocity[np.arange(len(feet)), lower]
+    apart = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)  # a foot that lies flat goes with the ground as a whole
+    median = np.median(ends[apart <= np.quantile(apart, _FLAT_SHARE)].mean(axis=1), axis=0)
     speed = float(np.linalg.norm(median))
     moved = float(np.linalg.norm(pelvis[-1] - pelvis[0])) * rate / (len(pelvis) - 1)
     return np.asarray(median if speed > max(_LEAST_BELT, 2.0 * moved) else np.zeros(2))

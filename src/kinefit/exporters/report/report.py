@@ -325,8 +325,9 @@ def _cycles(motion: Motion, cycles: Cycles | None, norms: Norms) -> list[p.Html]
     )
     if np.isfinite(cycles.likeness):
         text += f" The cycles' coefficient of multiple correlation is {cycles.likeness:.2f}."
-    notes = foot_findings(motion) if cycles.kind == "gait" else ()
-    parts = [*(p.callout("note", found.text) for found in notes), p.paragraph(text), gait_table(motion, cycles)]
+    told = of_provenance(motion.provenance)  # above
+    notes = [p.callout("note", found.text) for found in foot_findings(motion) if found not in told]
+    parts = [*notes, p.paragraph(text), gait_table(motion, cycles)]
     if norms:
         parts.append(p.paragraph("The grey band is the normative mean ±1 standard deviation of the table given."))
     return [*parts, p.chooser("Joint", cycle_plots([(motion, cycles)], norms))]
