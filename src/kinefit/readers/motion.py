@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from os import PathLike
 from pathlib import Path
 
@@ -61,10 +61,7 @@ LASTING_SHAPES = {"frames": "K<F", "constant": "K N C!", "drift": "K N d!", "dri
 PARAMETER_SHAPES = {
     "names": "P$", "values": "P!", "covariance": "P P!", "information": "P P!", "directions": "C P!",
 }  # fmt: skip
-EVENT_SHAPES = {
-    "label": "e$", "time": "e!", "context": "e$", "subject": "e$", "description": "e$", "icon": "e", "flag": "e",
-    "source": "e$",
-}  # fmt: skip
+EVENT_SHAPES = {f.name: {"str": "e$", "float": "e!", "int": "e"}[str(f.type)] for f in fields(MarkerEvent)}
 PLATE_SHAPES = {"corners": "4 3!", "rate": "", "first_time": "", "force": "n 3", "moment": "n 3"}
 SURFACE_SHAPES = {"rms": "F k", "count": "F k"}
 _REMEDY = "Write it again with kinefit, or copy it again from its source."

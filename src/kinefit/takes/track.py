@@ -109,8 +109,7 @@ def track_take(
             raise TrackingInterrupted(motion, stopped.total) from None
         except KinefitError as error:
             raise with_cause(error, findings) from error
-    motion = motion.with_mass(_mass_of(take, seen, motion.body))
-    motion = replace(motion, plates=seen.plates, events=seen.events)
+    motion = replace(motion.with_mass(_mass_of(take, seen, motion.body)), plates=seen.plates, events=seen.events)
     motion = with_findings(motion, (*findings, *foot_findings(motion)), seen, take.height)
     motion = on_floor(motion, recording, view.floors if view else [])
     if seen.rig is not None:

@@ -310,11 +310,10 @@ def fit_file(
         motion = fit_markers(
             subject, markers, limits=options.limits, up=options.up, smooth=options.smooth, progress=step
         )
-        shared = list[Finding]()
-        if len(people) > 1:
-            plates, shared = stood_on(motion, [one for name, one in people.items() if name != person])
-            motion = replace(motion, plates=plates)
-        elif options.mass is None:
+        others = [one for name, one in people.items() if name != person]
+        plates, shared = stood_on(motion, others) if others else (motion.plates, [])
+        motion = replace(motion, plates=plates)
+        if options.mass is None and not others:
             motion = motion.with_mass(standing_mass([trial.plates if trial else (), markers.plates], motion.body))
         findings = [*faults_of(found_labels), *motion_findings(motion, options.height), *shared, *foot_findings(motion)]
         wrong = (found for found in findings if found.severity != "note")

@@ -347,8 +347,7 @@ def _misplaced(own: list[_Loaded]) -> tuple[str, str]:
     good = [how for how, after in found.items() if after < min(_MAX_CORRECTED, _CORRECTED_SHARE * before)]
     name, far = own[0].plate.name, f"its centre of pressure is {100 * before:.0f} cm from the nearest foot"
     if good:
-        sure = "Likely: so corrected, each step lies under its foot; another person on the plate looks the same."
-        return f"{name} is {' or '.join(good)}: {far}.", sure
+        return f"{name} is {' or '.join(good)}: {far}.", "Likely, if nobody else is there: steps then lie under feet."
     if before < _FOOT_OFFSET:
         return "", ""
     return f"{name} does not lie under the feet: {far}.", "Certain; neither a shift nor a turn explains it."

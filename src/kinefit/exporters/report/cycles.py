@@ -63,10 +63,9 @@ class Cycles:
     def events(self) -> tuple[MarkerEvent, ...]:
         """Contacts and toe-offs, in the order of their times, named as marker systems do; none of other movements."""
         found = [
-            MarkerEvent(label, float(time), foot.side.capitalize(), icon=icon)
+            MarkerEvent(label, float(time), foot.side.capitalize(), icon=1 + (label == "Foot Off"))
             for foot in ((self.feet.left, self.feet.right) if self.feet else ())
-            for icon, (label, times) in enumerate((("Foot Strike", foot.contacts), ("Foot Off", foot.offs)), 1)
-            for time in times
+            for label, times in (("Foot Strike", foot.contacts), ("Foot Off", foot.offs)) for time in times
         ]  # fmt: skip
         return tuple(sorted(found, key=lambda event: event.time))
 

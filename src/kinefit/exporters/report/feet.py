@@ -104,7 +104,8 @@ def footing(motion: Motion) -> Footing | None:
     Steps that are shorter than 12 % of the stature are left out, and what is next to the ends of the motion.
     """
     if motion not in _FOOTINGS:
-        _FOOTINGS[motion] = _footing(motion)
+        feet = feet_alone(motion)
+        _FOOTINGS[motion] = None if feet is None else _with_files(motion, feet)
     return _FOOTINGS[motion]
 
 
@@ -114,10 +115,8 @@ def foot_events(motion: Motion) -> Feet | None:
     return found.feet if found else None
 
 
-def _footing(motion: Motion) -> Footing | None:
-    feet = feet_alone(motion)
-    if feet is None:
-        return None
+def _with_files(motion: Motion, feet: Feet) -> Footing:
+    """Feet with what the plates and the files of the recording say of them."""
     belt = rotation_between_up(motion.up, "y").T @ [feet.belt[0], 0.0, feet.belt[1]]
     steps, findings = feet_on_plates(motion, [(f.contacts, f.offs) for f in (feet.left, feet.right)], belt)
     feet = replace(feet, left=_with_plates(feet.left, steps), right=_with_plates(feet.right, steps))
