@@ -11,7 +11,7 @@ _RATE, _WEIGHT = 1000.0, 440.0  # [Hz], [N]
 
 
 def on_belt(walk, speed=None):
-    """The walk on a belt under it, its velocity (3,) [m/s], and its feet over the ground; default: it stays in place."""
+    """The walk on a belt under it, its velocity (3,) [m/s], and its feet over the ground; default: in place."""
     hips = walk.positions(walk.body.landmarks.select(("l_hip", "r_hip"))).mean(axis=1)
     way = (hips[-1] - hips[0]) * [1.0, 1.0, 0.0] / (walk.times[-1] - walk.times[0])
     belt = -way if speed is None else -speed * way / np.linalg.norm(way)

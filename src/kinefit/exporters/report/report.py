@@ -31,7 +31,6 @@ from kinefit.exporters.report.angles import (
     with_error,
 )
 from kinefit.exporters.report.cycles import Cycles, Norms, find_cycles, gait_numbers
-from kinefit.exporters.report.feet import foot_findings
 from kinefit.exporters.report.figure import figure
 from kinefit.exporters.report.fit import overall_median, point_table, quality_plot, sensor_fits, sensor_table
 from kinefit.exporters.report.flagged import Pictures, flagged, report_frames
@@ -325,9 +324,7 @@ def _cycles(motion: Motion, cycles: Cycles | None, norms: Norms) -> list[p.Html]
     )
     if np.isfinite(cycles.likeness):
         text += f" The cycles' coefficient of multiple correlation is {cycles.likeness:.2f}."
-    told = of_provenance(motion.provenance)  # above
-    notes = [p.callout("note", found.text) for found in foot_findings(motion) if found not in told]
-    parts = [*notes, p.paragraph(text), gait_table(motion, cycles)]
+    parts = [p.paragraph(text), gait_table(motion, cycles)]
     if norms:
         parts.append(p.paragraph("The grey band is the normative mean ±1 standard deviation of the table given."))
     return [*parts, p.chooser("Joint", cycle_plots([(motion, cycles)], norms))]
