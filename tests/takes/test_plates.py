@@ -133,7 +133,7 @@ def test_check_compares_plates_and_events_with_the_feet(data_dir, tmp_path, seco
 
 def test_the_report_of_track_names_the_event(data_dir, tmp_path):
     take = walk_take(data_dir, tmp_path, 0.06)
-    done = CliRunner().invoke(main, ["track", str(take), "-o", str(tmp_path / "out"), "--formats", "bvh"])
+    done = CliRunner().invoke(main, ["track", str(take), "-o", str(tmp_path / "out"), "--formats", "motion"])
     assert done.exit_code == 0, done.output
     assert "left contact at 3.600 s" in (tmp_path / "out" / "report.html").read_text("utf-8")
     assert read_motion(tmp_path / "out").events == read_markers(tmp_path / "walk.c3d").events

@@ -4,7 +4,8 @@
 
 Every file is fitted by `kinefit markers fit` with its static trial and defaults. A plate's truth is where its vertical
 force passes 20 N, of contacts that last a quarter of a second on one plate. The shares of the swing's speed that make
-an event were chosen on the children HC002D, HC036A and HC050A; the figures are of the others. Steps are compared with
+an event were chosen on the children HC002D, HC036A and HC050A, and on the plates of subject 4 and the sprinter of
+`forces_nimblephysics`; the figures are of the others. Steps are compared with
 the heels' markers at the same times. Events of the feet are those without plates; how many of the plates' the product
 itself finds, with the right foot, is a figure of its own.
 """
