@@ -12,6 +12,7 @@ from tests.exporters.synthetic import smooth_motion
 from kinefit.errors import ExportError
 from kinefit.exporters import write_nwb
 from kinefit.exporters.interchange import CONFIDENCE_RADIUS_M, confidence
+from kinefit.geometry.force_plates import ForcePlate
 
 
 def quiet(do):
@@ -99,3 +100,29 @@ def test_what_cannot_be_written_is_told(motion, tmp_path, monkeypatch):
     with pytest.raises(ExportError, match=r"kinefit\[nwb\]"):
         write_nwb(motion, tmp_path / "a.nwb")
     assert not list(tmp_path.iterdir())
+
+
+def test_force_plates_are_acquisition(motion, tmp_path):
+    corners = np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    force = np.tile([10.0, -5.0, 600.0], (40, 1))
+    force[:8] = 0.0
+    plate = ForcePlate("plate 1", corners, 1000.0, 0.25, force, np.tile([60.0, -30.0, 2.0], (40, 1)))
+    write_nwb(replace(motion, plates=(plate,)), tmp_path / "a.nwb", up="y")
+    turned = replace(motion, plates=(plate,)).turned("y").plates[0]
+    wanted = {"force": (turned.force, "newtons"), "moment": (turned.moment, "newton meters"),
+              "centre_of_pressure": (turned.centre_of_pressure(), "meters")}  # fmt: skip
+
+    def read():
+        with pynwb.NWBHDF5IO(str(tmp_path / "a.nwb"), "r", load_namespaces=True) as opened:
+            acquired = opened.read().acquisition
+            assert set(acquired) == {f"plate_1_{what}" for what in wanted}
+            for what, (values, unit) in wanted.items():
+                series = acquired[f"plate_1_{what}"]
+                np.testing.assert_array_equal(series.data[:], values)
+                assert (series.unit, series.rate, series.starting_time) == (unit, 1000.0, 0.25)
+                assert "y up" in series.description
+
+    quiet(read)
+    assert np.isnan(wanted["centre_of_pressure"][0][:8]).all() and not quiet(
+        lambda: list(pynwb.validate(path=str(tmp_path / "a.nwb")))
+    )

@@ -46,7 +46,7 @@ def written(tmp_path):
 def test_everything_comes_back_exactly(written):
     motion, path = written
     back = read_motion(path)
-    assert len(fields(motion)) == len(ARRAYS) + 8  # whoever adds one to a motion adds it to its file
+    assert len(fields(motion)) == len(ARRAYS) + 9  # whoever adds one to a motion adds it to its file
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(back, name), getattr(motion, name), strict=True)
     assert (back.rate, back.up, back.name) == (motion.rate, motion.up, motion.name)

@@ -4,11 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
-from kinefit import fit_marker_subject, fit_markers, load_body, load_observations, read_markers, read_take
+from kinefit import (
+    fit_marker_subject,
+    fit_markers,
+    load_body,
+    load_observations,
+    read_markers,
+    read_motion,
+    read_take,
+)
+from kinefit.cli import main
 from kinefit.errors import FileError, KinefitError
 from kinefit.exporters import write_forces, write_markers
 from kinefit.readers.guess.folder import guess_take
+from kinefit.studio.live.take import live_session
+from kinefit.takes.check import check_take
 
 
 @pytest.fixture(scope="module")
@@ -98,3 +110,36 @@ def test_forces_of_another_trial_are_a_comment(folder, tmp_path):
     assert '# [[plate]]\n# file = "b_grf.mot"' in text and "\n[[plate]]" not in text
     (tmp_path / "b_grf.mot").rename(tmp_path / "session.mot")
     assert '\n[[plate]]\nfile = "session.mot"' in guess_take(tmp_path).text  # the only forces there
+
+
+def walk_take(data_dir, folder, seconds):
+    """A take of a child's walk whose file marks a contact of the left foot so much later."""
+    source = data_dir("gait_biomechzoo") / "HC030A" / "straight.c3d"
+    markers = read_markers(source)
+    first = next(event for event in markers.events if (event.label, event.context) == ("Foot Strike", "Left"))
+    events = tuple(replace(e, time=e.time + seconds) if e == first else e for e in markers.events)
+    write_markers(replace(markers, events=events), folder / "walk.c3d", like=source)
+    (folder / "take.toml").write_text('[take]\nup = "z"\n[[markers]]\nfile = "walk.c3d"\n')
+    return folder / "take.toml"
+
+
+@pytest.mark.parametrize(("seconds", "severity"), [(0.0, "good"), (0.06, "doubt")])
+def test_check_compares_plates_and_events_with_the_feet(data_dir, tmp_path, seconds, severity):
+    found = check_take(walk_take(data_dir, tmp_path, seconds)).findings
+    (told,) = (one for one in found if one.kind in ("plates", "events"))
+    assert told.severity == severity
+    assert ("left contact at 3.600 s" in told.text) == (severity == "doubt")
+
+
+def test_the_report_of_track_names_the_event(data_dir, tmp_path):
+    take = walk_take(data_dir, tmp_path, 0.06)
+    done = CliRunner().invoke(main, ["track", str(take), "-o", str(tmp_path / "out"), "--formats", "motion"])
+    assert done.exit_code == 0, done.output
+    assert "left contact at 3.600 s" in (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert read_motion(tmp_path / "out").events == read_markers(tmp_path / "walk.c3d").events
+
+
+def test_a_live_replay_says_that_plates_have_no_part(data_dir, tmp_path):
+    told = []
+    live_session(read_take(walk_take(data_dir, tmp_path, 0.0)), tell=told.append).close()
+    assert any("Force plates have no part" in text and "kinefit track" in text for text in told)

@@ -4,7 +4,8 @@
 
 Every file is fitted by `kinefit markers fit` with its static trial and defaults. A plate's truth is where its vertical
 force passes 20 N, of contacts that last a quarter of a second on one plate. The shares of the swing's speed that make
-an event were chosen on the children HC002D, HC036A and HC050A; the figures are of the others. Steps are compared with
+an event were chosen on the children HC002D, HC036A and HC050A, and on the plates of subject 4 and the sprinter of
+`forces_nimblephysics`; the figures are of the others. Steps are compared with
 the heels' markers at the same times. Events of the feet are those without plates; how many of the plates' the product
 itself finds, with the right foot, is a figure of its own.
 """
@@ -23,9 +24,8 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, data, figure
 from kinefit.bodies.motion import Motion
-from kinefit.exporters.gait.plates import footfalls
 from kinefit.exporters.report.cycles import find_cycles, gait_numbers
-from kinefit.exporters.report.feet import foot_events
+from kinefit.exporters.report.feet import foot_events, footing
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
 from kinefit.readers.motion import read_motion
@@ -69,7 +69,8 @@ def run() -> None:
         for event in _own(markers):
             own[event.kind].append((_after_plate(event, on_plates), missed(motion, event)[0]))
         steps += _steps(motion, markers)
-        found = [(step.side[0], time) for step in footfalls(measured) for time in (step.contact, step.off)]
+        steps_on_plates = found.steps if (found := footing(measured)) else ()
+        found = [(step.side[0], time) for step in steps_on_plates for time in (step.contact, step.off)]
         plated += [
             any(side == event.foot and abs(time - event.time) < _SAME_S for side, time in found)
             for event in on_plates

@@ -140,6 +140,29 @@ def _turned_std(std: NDArray, R: NDArray, rays: NDArray | None = None) -> NDArra
     return np.where(finite.all(axis=-1, keepdims=True), np.sqrt(out), np.inf)
 
 
+@dataclass(frozen=True)
+class MarkerEvent:
+    """An event marked in a recording, as a C3D has it.
+
+    Parameters
+    ----------
+    label : str, such as "Foot Strike"
+    time : float [s] on the recording's own clock, that of `Markers.times`
+    context : str, such as "Left"; subject, description : str
+    icon, flag : int, of ICON_IDS (of laboratories: 1 of a contact, 2 of a toe-off) and GENERIC_FLAGS
+    source : str, name of the file that marks it
+    """
+
+    label: str
+    time: float
+    context: str = ""
+    subject: str = ""
+    description: str = ""
+    icon: int = 0
+    flag: int = 0
+    source: str = ""
+
+
 @dataclass(frozen=True, eq=False)
 class Motion:
     """A body's motion.
@@ -170,6 +193,7 @@ class Motion:
     lasting : LastingErrors
         Errors that frames have in common, see `std_of`; None where unknown.
     plates : force plates that were recorded with it, in its world and by its clock
+    events : that files of the recording mark, by its clock
     """
 
     body: Body
@@ -187,6 +211,7 @@ class Motion:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     lasting: LastingErrors | None = None
     plates: tuple[ForcePlate, ...] = ()
+    events: tuple[MarkerEvent, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ARRAYS:

@@ -18,7 +18,7 @@ from kinefit._files import LENGTHS, write_bytes, write_text
 from kinefit.bodies.motion import Motion
 from kinefit.errors import ExportError
 from kinefit.exporters.opensim import trc_head
-from kinefit.exporters.report.cycles import find_gait
+from kinefit.exporters.report.cycles import events_of
 from kinefit.exporters.skeletons.common import UNITS, bone_names, convention, length_factor, plain_names, turned
 from kinefit.exporters.tables import Curve, curves
 from kinefit.observations import MarkerEvent, Markers
@@ -137,8 +137,8 @@ def write_c3d(
     Centres and landmarks are there in all frames, with residual 0: computed, not measured. Angles are points that
     POINT:ANGLES lists, as laboratories' programs expect them: the coordinates of a joint in degrees as x, y and z, as
     `LHipAngles`; missing in frames in which none of them is observed. The first frame's number follows from its time,
-    frame 1 being at 0 s. Contacts and toe-offs of a walk are EVENTs, "Foot Strike" and "Foot Off". Force plates are
-    analog channels and FORCE_PLATFORM, of type 2.
+    frame 1 being at 0 s. Contacts and toe-offs of a walk are EVENTs, "Foot Strike" and "Foot Off", in place of those of
+    the recording, whose other events are kept. Force plates are analog channels and FORCE_PLATFORM, of type 2.
 
     Parameters
     ----------
@@ -183,8 +183,8 @@ def write_c3d(
         },
         "ANALOG": {"USED": np.array(0, np.uint16), "RATE": np.array(motion.rate, np.float32), "LABELS": []},
     }  # fmt: skip
-    if gait := find_gait(motion):
-        groups["EVENT"] = _events(gait.events)
+    if events := events_of(motion):
+        groups["EVENT"] = _events(events)
     analog, samples = None, 1
     if world.plates:
         groups["ANALOG"], groups["FORCE_PLATFORM"], analog, samples = _plates(world, unit, factor)
@@ -338,13 +338,19 @@ def _residual_unit(residual: NDArray) -> float:
 
 
 def _events(events: Sequence[MarkerEvent]) -> dict[str, Value]:
-    times = np.array([[e.time // 60.0, e.time % 60.0] for e in events], np.float32).T
-    count = len(events)
-    return {
-        "USED": np.array(count, np.uint16), "CONTEXTS": [e.context for e in events],
-        "LABELS": [e.label for e in events], "SUBJECTS": [e.subject for e in events], "TIMES": times,
-        "ICON_IDS": np.zeros(count, np.uint16), "GENERIC_FLAGS": np.zeros(count, np.uint8),
-    }  # fmt: skip
+    """The group EVENT: no list holds more than 255, the next ones go on with LABELS2, TIMES2 ..."""
+    out: dict[str, Value] = {"USED": np.array(len(events), np.uint16)}
+    for k in range(0, len(events), _MAX_DIMENSION):
+        part, suffix = events[k : k + _MAX_DIMENSION], str(k // _MAX_DIMENSION + 1) if k else ""
+        lists: dict[str, Value] = {
+            "CONTEXTS": [e.context for e in part], "LABELS": [e.label for e in part],
+            "SUBJECTS": [e.subject for e in part], "DESCRIPTIONS": [e.description for e in part],
+            "TIMES": np.array([[e.time // 60.0, e.time % 60.0] for e in part], np.float32).T,
+            "ICON_IDS": np.array([e.icon for e in part], np.uint16),
+            "GENERIC_FLAGS": np.array([e.flag for e in part], np.uint8),
+        }  # fmt: skip
+        out |= {name + suffix: values for name, values in lists.items()}
+    return out
 
 
 def _trc(markers: Markers, path: Path, unit: str, factor: float) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from os import PathLike
 from typing import Any
 from uuid import NAMESPACE_URL, uuid5
@@ -27,8 +27,9 @@ def write_nwb(motion: Motion, path: str | PathLike[str], *, up: str | None = Non
     Every joint has a PoseEstimationSeries in metres, whose confidence is the probability that the true centre lies
     within 2 cm, by the error bars (`joint_std`, taken as equal in all directions); 0 where nothing observed it.
     The module holds TimeSeries of all joint coordinates (`angles`, radians, metres where they slide) and of the
-    standard deviations (`joint_std`, `angles_std`), too. The session starts on the date that the take states, else on
-    1970-01-01, and the file says so.
+    standard deviations (`joint_std`, `angles_std`), too. The acquisition holds what force plates measured, at their own
+    rates: `plate_1_force` [N], `plate_1_moment` [N m] about the middle of its corners and `plate_1_centre_of_pressure`
+    [m], NaN below 20 N. The session starts on the date that the take states, else on 1970-01-01, and the file says so.
 
     Parameters
     ----------
@@ -59,6 +60,8 @@ def write_nwb(motion: Motion, path: str | PathLike[str], *, up: str | None = Non
         behavior = file.create_processing_module("behavior", "motion of a body, fitted by kinefit")
         for thing in _pose(ndx_pose, pynwb, world, plain_names(bone.replace(":", "_") for bone in bones)):
             behavior.add(thing)
+        for series in _plates(pynwb, world):
+            file.add_acquisition(series)
         with pynwb.NWBHDF5IO(str(temporary), "w") as out:
             out.write(file)
 
@@ -125,6 +128,20 @@ def _pose(ndx_pose: Any, pynwb: Any, motion: Motion, bones: list[str]) -> list[A
         ndx_pose.Skeletons(skeletons=[skeleton]), pose,
         *(pynwb.TimeSeries(name=n, data=np.array(d), unit=u, description=t, **times) for n, d, u, t in beside),
     ]  # fmt: skip
+
+
+def _plates(pynwb: Any, motion: Motion) -> Iterator[Any]:
+    """Time series of each plate's force, moment and centre of pressure."""
+    for plate, name in zip(motion.plates, plain_names(plate.name for plate in motion.plates)):
+        times = {"rate": plate.rate, "starting_time": plate.first_time}
+        about = f"{plate.name}, corners [m] {plate.corners.round(4).tolist()}, along x, y, z of a world, {motion.up} up"
+        for what, unit, values, text in (
+            ("force", "newtons", plate.force, "on the person"),
+            ("moment", "newton meters", plate.moment, "on the person, about the middle of the corners"),
+            ("centre_of_pressure", "meters", plate.centre_of_pressure(), "NaN below 20 N"),
+        ):
+            series = {"data": np.array(values), "unit": unit, "description": f"{text}; {about}"}
+            yield pynwb.TimeSeries(name=f"{name}_{what}", **series, **times)
 
 
 WORLD = "world"

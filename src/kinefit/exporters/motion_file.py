@@ -49,6 +49,9 @@ def write_motion(motion: Motion, path: str | PathLike[str]) -> None:
         arrays |= arrays_of(residuals, shapes, f"residuals/{quote(sensor, safe='')}/")
     for plate in motion.plates:
         arrays |= arrays_of(plate, form.PLATE_SHAPES, f"plates/{quote(plate.name, safe='')}/")
+    if motion.events:
+        columns = {name: [getattr(event, name) for event in motion.events] for name in form.EVENT_SHAPES}
+        arrays |= {f"events/{name}": np.array(values) for name, values in columns.items()}
     _write(path, "a motion file", form, arrays)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.marker_sets import read_sides
+from kinefit.bodies.motion import MarkerEvent
 from kinefit.errors import ObservationError
 from kinefit.geometry.force_plates import ForcePlate
 from kinefit.observations.arrays import check_seen, freeze, frozen, sealed
@@ -211,23 +212,6 @@ class Keypoints:
     def times(self) -> NDArray:
         """(F,) [s] time of every frame in the take."""
         return np.arange(len(self)) / self.rate + self.time_offset
-
-
-@dataclass(frozen=True)
-class MarkerEvent:
-    """An event marked in a recording.
-
-    Parameters
-    ----------
-    label : str, such as "Foot Strike"
-    time : float [s] on the recording's own clock, that of `Markers.times`
-    context : str, such as "Left"; subject : str
-    """
-
-    label: str
-    time: float
-    context: str = ""
-    subject: str = ""
 
 
 @dataclass(frozen=True, eq=False)

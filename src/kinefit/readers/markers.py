@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,10 @@ from kinefit.readers.plates import PlatesRead, read_plates
 from kinefit.readers.plugins import MARKERS, FileFormat
 
 _MAX_NEAR_ORIGIN = 0.01  # [m] from the origin, of a person in metres that are read as millimetres
+_OF_EVENT: dict[str, tuple[str, type]] = {
+    "label": ("LABELS", str), "context": ("CONTEXTS", str), "subject": ("SUBJECTS", str),
+    "description": ("DESCRIPTIONS", str), "icon": ("ICON_IDS", int), "flag": ("GENERIC_FLAGS", int),
+}  # fmt: skip
 _COMPUTED_POINTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # of a C3D: no positions
 _STATE = 'State it: --unit mm on the command line, unit="mm" from Python, unit = "mm" in a take.'
 _OF_AXIS = re.compile(r"(.+?)[\s_.:(\[-]*([xyz])[)\]]?", re.IGNORECASE)  # a label that is repeated for each axis
@@ -113,27 +118,27 @@ def _of_one_unit(markers: Markers) -> Markers:
     return markers
 
 
-def _texts(c3d: C3d, key: str) -> list[str]:
-    """A text parameter with its continuations: LABELS, LABELS2 ..."""
-    found: list[str] = []
+def _entries(c3d: C3d, key: str, kind: type = str) -> list[Any]:
+    """Texts or numbers of a parameter with its continuations, in the order of the file: LABELS, LABELS2 ..."""
+    found: list[Any] = []
     for suffix in ("", *map(str, range(2, 100))):
         values = c3d.parameters.get(key + suffix)
-        if not isinstance(values, list):
+        if values is None:
             break
-        found += values
-    return found
+        found += values.ravel(order="F").tolist() if isinstance(values, np.ndarray) else values
+    return [value for value in found if isinstance(value, kind)]
 
 
 def _read_c3d(path: Path, unit: str | None) -> Markers:
     c3d = read_c3d(path)
     count = c3d.points.shape[1]
-    labels = (_texts(c3d, "POINT:LABELS") + [""] * count)[:count]
-    computed = {name for kind in _COMPUTED_POINTS for name in _texts(c3d, f"POINT:{kind}")} - {""}
+    labels = (_entries(c3d, "POINT:LABELS") + [""] * count)[:count]
+    computed = {name for kind in _COMPUTED_POINTS for name in _entries(c3d, f"POINT:{kind}")} - {""}
     keep = [i for i, label in enumerate(labels) if label not in computed]
     if not keep:
         raise ObservationError("all points of this file are computed quantities, none is a marker")
-    screen = "".join(_texts(c3d, "POINT:Y_SCREEN")[:1]).strip().lower().removeprefix("+")
-    unit = unit or next(iter(_texts(c3d, "POINT:UNITS")), None)
+    screen = "".join(_entries(c3d, "POINT:Y_SCREEN")[:1]).strip().lower().removeprefix("+")
+    unit = unit or next(iter(_entries(c3d, "POINT:UNITS")), None)
     metres = _metres(unit)
     if c3d.missing[:, keep].all():
         raise _unseen(len(keep), len(c3d.points))
@@ -146,21 +151,21 @@ def _read_c3d(path: Path, unit: str | None) -> Markers:
     return Markers(
         tuple(_unique(labels)[i] for i in keep), c3d.rate, positions[:, keep], residual=c3d.residual[:, keep] * metres,
         up=up, first_frame=c3d.first_frame, source=str(path),
-        unit=str(unit).strip().lower(), events=_events(c3d),
+        unit=str(unit).strip().lower(), events=_events(c3d, path.name),
         notes=tuple(f"{path.name}: {note}" for note in (*c3d.notes, *forces.notes)), plates=forces.plates,
     )
 
 
-def _events(c3d: C3d) -> tuple[MarkerEvent, ...]:
+def _events(c3d: C3d, source: str) -> tuple[MarkerEvent, ...]:
     """Events of the group EVENT, else of the header, in the order of their times."""
-    times = c3d.parameters.get("EVENT:TIMES")
-    labels, contexts, subjects = (_texts(c3d, f"EVENT:{name}") for name in ("LABELS", "CONTEXTS", "SUBJECTS"))
-    found = [MarkerEvent(label, time) for label, time in c3d.events]
-    if isinstance(times, np.ndarray) and times.dtype.kind == "f" and times.size and times.size % 2 == 0:
-        pairs = times.reshape((2, -1), order="F").astype(float)  # minutes, seconds
-        seconds = 60.0 * pairs[0] + pairs[1]
-        many = [(texts + [""] * len(seconds))[: len(seconds)] for texts in (labels, contexts, subjects)]
-        found = [MarkerEvent(n, float(t), c, s) for n, t, c, s in zip(many[0], seconds, *many[1:], strict=True)]
+    times, found = _entries(c3d, "EVENT:TIMES", float), list[MarkerEvent]()  # minutes and seconds in turn
+    if not times:
+        found = [MarkerEvent(label, time, source=source) for label, time in c3d.events]
+    else:
+        columns = {name: _entries(c3d, f"EVENT:{key}", kind) for name, (key, kind) in _OF_EVENT.items()}
+        for k, (minutes, seconds) in enumerate(zip(times[::2], times[1::2])):
+            known = {"label": ""} | {name: values[k] for name, values in columns.items() if k < len(values)}
+            found.append(MarkerEvent(time=60.0 * minutes + seconds, source=source, **known))
     return tuple(sorted((e for e in found if np.isfinite(e.time)), key=lambda e: e.time))
 
 

@@ -22,6 +22,8 @@ F frames, S segments, D coordinates; metres, radians, seconds, pixels; float64 u
     residuals/SENSOR/values (F, K, N)                 measured minus fitted, NaN if unobserved; N = 2 or 3
     residuals/SENSOR/measured (F, K, N)  weights (F, K)
     plates/NAME/corners (4, 3)  rate ()  first_time ()  force (n, 3)  moment (n, 3)     [m, Hz, s, N, N m]
+    events/label (e,)  context (e,)  subject (e,)  description (e,)  source (e,)        text; all of events/ optional
+    events/time (e,)  icon (e,)  flag (e,)            [s], int, int
     residuals/SENSOR/swapped (F,)    bool, the detector swapped left and right, corrected
 
 Sensor names are percent-encoded in keys.
@@ -31,16 +33,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from os import PathLike
 from pathlib import Path
 
+import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import read_npz, regular
 from kinefit.bodies.lasting_errors import LastingErrors, ParameterErrors
-from kinefit.bodies.motion import Motion, Residuals
+from kinefit.bodies.motion import MarkerEvent, Motion, Residuals
 from kinefit.bodies.serial import below, body_from_arrays, fields_of, prefixes
 from kinefit.errors import FileError, KinefitError, command
 from kinefit.geometry.force_plates import ForcePlate
@@ -58,6 +61,7 @@ LASTING_SHAPES = {"frames": "K<F", "constant": "K N C!", "drift": "K N d!", "dri
 PARAMETER_SHAPES = {
     "names": "P$", "values": "P!", "covariance": "P P!", "information": "P P!", "directions": "C P!",
 }  # fmt: skip
+EVENT_SHAPES = {f.name: {"str": "e$", "float": "e!", "int": "e"}[str(f.type)] for f in fields(MarkerEvent)}
 PLATE_SHAPES = {"corners": "4 3!", "rate": "", "first_time": "", "force": "n 3", "moment": "n 3"}
 SURFACE_SHAPES = {"rms": "F k", "count": "F k"}
 _REMEDY = "Write it again with kinefit, or copy it again from its source."
@@ -145,7 +149,11 @@ def _motion(arrays: Mapping[str, NDArray]) -> Motion:
         lasting = replace(lasting, parameters=known)
     found = prefixes(arrays, "plates").items()
     plates = tuple(ForcePlate(name, **fields_of(arrays, PLATE_SHAPES, sizes, prefix)) for name, prefix in found)
-    return Motion(body=body, **own, residuals=residuals, provenance=provenance, lasting=lasting, plates=plates)
+    marked = fields_of(arrays, EVENT_SHAPES, sizes, "events/") if "events/time" in arrays else {}
+    events = tuple(MarkerEvent(*one) for one in zip(*(np.asarray(values).tolist() for values in marked.values())))
+    return Motion(
+        body=body, **own, residuals=residuals, provenance=provenance, lasting=lasting, plates=plates, events=events
+    )  # fmt: skip
 
 
 def _residuals(arrays: Mapping[str, NDArray], prefix: str, sizes: dict[str, int]) -> Residuals:

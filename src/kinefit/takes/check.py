@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from os import PathLike
 
 from kinefit._arguments import checked
 from kinefit.bodies import load_body
 from kinefit.errors import KinefitError, command
+from kinefit.exporters.report.feet import foot_findings
 from kinefit.findings import Finding
+from kinefit.fitting.markers.subject import fit_marker_subject
 from kinefit.fitting.subject.subject import Subject
+from kinefit.fitting.tracking.markers import fit_markers
 from kinefit.fitting.tracking.sizing import SizedPerson, sized_by_depth
 from kinefit.fitting.tracking.take_recording import label_findings_of, recording_of, sensors_of
 from kinefit.readers.take.cameras import is_alone
@@ -87,6 +91,23 @@ def _sensors(c: Checked) -> list[Finding]:
     return sensor_findings(c.sensors, c.take)
 
 
+def _feet(c: Checked) -> list[Finding]:
+    """Force plates, and the events of marker files, against the feet of the first labelled markers."""
+    seen = c.observations
+    if not (seen.plates or seen.events) or not c.take.markers or c.take.markers[0].model or c.faults:
+        return []
+    entry, markers, trial = c.take.markers[0], seen.markers[0].trimmed(), seen.static_markers[0]
+    try:
+        body, trials = load_body(c.take.body), [trial, markers] if trial else [markers]
+        subject = fit_marker_subject(body, trials, entry.set, height=c.take.height)
+        motion = fit_markers(subject, markers, up=c.take.up, smooth=False)
+    except KinefitError as error:
+        return [finding_of(error)]
+    times = motion.times + entry.time_offset
+    found = foot_findings(replace(motion, times=times, plates=seen.plates, events=seen.events))
+    return [*found] or [Finding("good", "plates", "Force plates and events of the files fit the feet.")]
+
+
 def _kinds(c: Checked) -> list[Finding]:
     """Sensors of kinds that stand apart: whether they can be made for the body, and what their own check finds."""
     out, body = list[Finding](), load_body(c.take.body)
@@ -119,6 +140,10 @@ ALL_CHECKS = (
     Check(
         "kinds of sensors", _kinds, ("take", "observations"), 1.0,
         "A wrong file, a clock that is off and another unit of the sensor look the same.",
+    ),
+    Check(
+        "force plates and events", _feet, ("take", "observations"), 10.0,
+        "Markers of the feet that moved on the skin look the same.",
     ),
     Check(
         "other sensors", _sensors, ("take", "observations", "keypoints"), 60.0,

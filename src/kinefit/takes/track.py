@@ -12,7 +12,7 @@ from kinefit.bodies import Body, load_body
 from kinefit.bodies.motion import Motion
 from kinefit.errors import KinefitError, TakeError, command, located
 from kinefit.exporters.gait.plates import standing_mass
-from kinefit.exporters.report.feet import plate_faults
+from kinefit.exporters.report.feet import foot_findings
 from kinefit.fitting.smoothing.online.fixed_lag import KnownNoise
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.subject.subject import Subject
@@ -103,8 +103,8 @@ def track_take(
             raise TrackingInterrupted(motion, stopped.total) from None
         except KinefitError as error:
             raise with_cause(error, findings) from error
-    motion = replace(motion.with_mass(_mass_of(take, seen, motion.body)), plates=seen.plates)
-    motion = with_findings(motion, (*findings, *plate_faults(motion)), seen, take.height)
+    motion = replace(motion.with_mass(_mass_of(take, seen, motion.body)), plates=seen.plates, events=seen.events)
+    motion = with_findings(motion, (*findings, *foot_findings(motion)), seen, take.height)
     motion = take_recording.on_floor(motion, recording, view.floors if view else [])
     if seen.rig is not None:
         seen = replace(seen, rig=take_recording.rig_on_floor(as_found(seen.rig, motion.provenance), motion.provenance))

@@ -9,14 +9,22 @@ import pytest
 
 from kinefit import load_body, read_markers, read_motion, write_motion
 from kinefit.exporters import write_c3d, write_forces
-from kinefit.exporters.gait.plates import by_plates, footfalls, plate_findings, standing_mass, stood_on
-from kinefit.exporters.report.feet import foot_events
+from kinefit.exporters.gait.plates import by_plates, feet_on_plates, standing_mass, stood_on
+from kinefit.exporters.report.feet import feet_alone, foot_events
 from kinefit.readers.plates import read_force_file
 
 
 def events_of(motion):
-    feet = foot_events(motion, plates=False)
+    feet = feet_alone(motion)
     return [(foot.contacts, foot.offs) for foot in (feet.left, feet.right)]
+
+
+def footfalls(motion):
+    return feet_on_plates(motion, events_of(motion), np.zeros(3))[0]
+
+
+def findings_of(motion, events):
+    return feet_on_plates(motion, events, np.zeros(3))[1]
 
 
 def test_steps_are_those_of_the_plates(walk):
@@ -47,7 +55,7 @@ def test_events_of_plates_replace_those_of_the_feet(walk):
     ],
 )
 def test_a_wrong_plate_is_named(walk, change, text):
-    found = plate_findings(replace(walk, plates=tuple(map(change, walk.plates))), events_of(walk))
+    found = findings_of(replace(walk, plates=tuple(map(change, walk.plates))), events_of(walk))
     if not text:
         assert not found
         return
@@ -57,7 +65,7 @@ def test_a_wrong_plate_is_named(walk, change, text):
 
 def test_nothing_is_said_of_plates_without_feet_or_load(walk):
     empty = replace(walk, plates=tuple(replace(p, force=0.0 * p.force, moment=0.0 * p.moment) for p in walk.plates))
-    assert not footfalls(empty) and not plate_findings(empty, events_of(walk))
+    assert not footfalls(empty) and not findings_of(empty, events_of(walk))
     assert not footfalls(replace(walk, plates=()))
 
 
@@ -139,7 +147,7 @@ def test_half_a_foot_on_a_plate_is_no_step(walk):
 
 def test_events_of_a_late_clock_are_not_used(walk):
     late = replace(walk, plates=tuple(plate.shifted(0.3) for plate in walk.plates))
-    alone, used = foot_events(late, plates=False), foot_events(late)
+    alone, used = feet_alone(late), foot_events(late)
     np.testing.assert_array_equal(alone.left.contacts, used.left.contacts)
     assert foot_events(walk).left.contact_std.min() < alone.left.contact_std.min()
 
@@ -147,14 +155,14 @@ def test_events_of_a_late_clock_are_not_used(walk):
 def test_a_plate_elsewhere_has_no_explanation(walk):
     rng = np.random.default_rng(0)
     moved = tuple(replace(p, moment=p.moment + rng.normal(scale=150.0, size=p.moment.shape)) for p in walk.plates)
-    found = plate_findings(replace(walk, plates=moved), events_of(walk))
+    found = findings_of(replace(walk, plates=moved), events_of(walk))
     assert found and all("neither a shift nor a turn" in f.confidence for f in found)
 
 
 def test_of_several_people_each_has_the_own_plates(walk):
-    assert len(stood_on(walk)) == 2
+    assert len(stood_on(walk, [])[0]) == 2
     beside = replace(walk, plates=tuple(replace(p, corners=p.corners + [1.5, 1.5, 0.0]) for p in walk.plates))
-    assert not stood_on(beside)
+    assert not stood_on(beside, [])[0]
 
 
 def test_forces_of_plates_with_clocks_of_their_own(walk, tmp_path):

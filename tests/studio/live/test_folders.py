@@ -195,6 +195,7 @@ KEYPOINTS = '[[keypoints]]\ncamera = "a"\nstream = "new"\n'
     (DEPTH, "neither a file nor a stream"), (STREAM, "a stream with intrinsics, and no size"),
     (STREAM + 'file = "old.npz"\nsize = [10, 10]\n', "a stream and a file"),
     (STREAM + 'size = [10, 10]\n[[markers]]\nfile = "a.trc"\n', "a recording cannot be combined with streams"),
+    (STREAM + 'size = [10, 10]\n[[plate]]\nfile = "a.mot"\n', "a recording cannot be combined with streams"),
     (STREAM + 'size = [10, 10]\n[start]\nclicks = "clicks.json"\n', "a recording cannot be combined with streams"),
     (CAMERA + KEYPOINTS + 'format = "mediapipe"\n', "'stream' has no use"),
     (CAMERA + 'stream = "0"\n' + KEYPOINTS, "its camera also has a stream"),

@@ -19,7 +19,7 @@ from kinefit.cli._screen import Step, check_file, note
 from kinefit.errors import KinefitError, ObservationError, located
 from kinefit.exporters import write_markers, write_osim, write_trc
 from kinefit.exporters.gait.plates import standing_mass, stood_on
-from kinefit.exporters.report.feet import plate_faults
+from kinefit.exporters.report.feet import foot_findings
 from kinefit.exporters.report.report import write_report
 from kinefit.exporters.skeletons.common import plain_names
 from kinefit.findings import FINDINGS, Finding, as_records, faults_of
@@ -291,12 +291,14 @@ def fit_file(
         motion = fit_markers(
             subject, markers, limits=options.limits, up=options.up, smooth=options.smooth, progress=step
         )
-        if len(people) > 1:
-            motion = replace(motion, plates=stood_on(motion))
-        elif options.mass is None:
+        others = [one for name, one in people.items() if name != person]
+        plates, shared = stood_on(motion, others) if others else (motion.plates, [])
+        motion = replace(motion, plates=plates)
+        if options.mass is None and not others:
             motion = motion.with_mass(standing_mass([trial.plates if trial else (), markers.plates], motion.body))
-        findings = [*faults_of(found_labels), *motion_findings(motion, options.height), *plate_faults(motion)]
-        motion = replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings)})
+        findings = [*faults_of(found_labels), *motion_findings(motion, options.height), *shared, *foot_findings(motion)]
+        wrong = (found for found in findings if found.severity != "note")
+        motion = replace(motion, provenance={**motion.provenance, FINDINGS: as_records(wrong)})
         if notes is not None:
             notes += [*findings, *(f for f in found_labels if f.severity == "note")]
         files: dict[str, Path] = {}

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.masses import segment_masses
-from kinefit.bodies.motion import UP_AXES, Motion
-from kinefit.exporters.gait.plates import GRAVITY, footfalls
+from kinefit.bodies.motion import Motion, rotation_between_up
+from kinefit.exporters.gait.plates import GRAVITY
+from kinefit.exporters.gait.record import headings
 from kinefit.exporters.report import page as p
+from kinefit.exporters.report.feet import footing
 
 PERCENT = np.linspace(0.0, 100.0, 101)
 """Of stance, from contact to toe-off, at which forces are given."""
@@ -37,25 +39,17 @@ class StepForces:
 def step_forces(motion: Motion) -> list[StepForces]:
     """Forces of all whole steps on the plates of a motion, in the order of their contacts."""
     weight = GRAVITY * float(segment_masses(motion.body).masses.sum())
-    up, plates, out = np.array(UP_AXES[motion.up]), {plate.name: plate for plate in motion.plates}, list[StepForces]()
-    for step in footfalls(motion):
+    upright, facing = rotation_between_up(motion.up, "y"), headings(motion)
+    plates, out = {plate.name: plate for plate in motion.plates}, list[StepForces]()
+    for step in found.steps if (found := footing(motion)) else ():
         if not np.isfinite([step.contact, step.off]).all():
             continue
         times = step.contact + (step.off - step.contact) * PERCENT / 100.0
         force = np.sum([plates[name].at(times).force for name in step.plate.split(", ")], axis=0)
-        across = _across(motion, float(times[len(times) // 2]))
-        ahead = np.cross(up, across)
-        ahead /= np.linalg.norm(ahead)
-        out.append(StepForces(step.side, force @ up / weight, force @ ahead / weight))
+        heading = np.interp(times[len(times) // 2], motion.times, facing)
+        ahead = np.array([np.cos(heading), 0.0, -np.sin(heading)]) @ upright
+        out.append(StepForces(step.side, force @ upright[1] / weight, force @ ahead / weight))
     return out
-
-
-def _across(motion: Motion, time: float) -> NDArray:
-    """(3,) [m] from the left hip to the right one in the world."""
-    frame = int(np.argmin(np.abs(motion.times - time)))
-    hips = motion.body.landmarks.select(("l_hip", "r_hip"))
-    left, right = motion.part(slice(frame, frame + 1)).positions(hips)[0]
-    return np.asarray(right - left)
 
 
 def force_plots(motions: Iterable[Motion]) -> list[p.Html]:

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.bodies.masses import segment_masses
 from kinefit.bodies.motion import Motion
-from kinefit.findings import Finding
+from kinefit.findings import Finding, listed
 from kinefit.geometry.force_plates import LEAST_LOAD, ForcePlate, total_load
+from kinefit.observations import Markers
 
 FOOT = "heel", "metatarsal_phalanx_1", "metatarsal_phalanx_5"
 """Landmarks of a foot, after "l_" or "r_"."""
@@ -26,6 +27,8 @@ GRAVITY = 9.81
 Events = Sequence[tuple[NDArray, NDArray]]
 """Contacts (N,) and toe-offs (M,) [s] of the left and of the right foot."""
 
+_Late = tuple[float, float, int]
+
 CONTACT_STD_S = 0.003
 """[s] that a load takes to rise to 20 N at the 5 to 10 kN/s of a heel."""
 
@@ -34,7 +37,9 @@ _MAX_OFF = 0.12  # [m] of the centre of pressure from the line between heel and 
 _WHOLE_SHARE = 0.9  # of the time, and of a foot's points, over a plate
 _NEARER = 0.05  # [m] by which the other foot is farther away, so that it is known whose step it is
 _EDGE = 0.03  # [m] beyond a plate's edge: the skin and errors of landmarks
-_MOVING = 0.5  # [m/s] of a foot that swings past the other: it stands on nothing
+_MOVING, _STANDING_SHARE = 0.5, 0.2  # [m/s] of a foot that swings past the other; of the time, in which it stands
+_LOW = 0.15  # [m] above a plate: markers of a foot that stands on it
+_PARTLY = "a foot stands partly beside it"
 _MIN_OFFSET, _MAX_CORRECTED = 0.06, 0.04  # [m] from the foot in the median: surely wrong; right once it is corrected
 _FOOT_OFFSET = 0.3  # [m]: about a foot's length beside it, somebody or something else stands there
 _CORRECTED_SHARE = 0.4  # of the distance before, once it is corrected
@@ -68,16 +73,23 @@ class _Loaded:
 
     Parameters
     ----------
-    cop : (n, 2) [m] centre of pressure along the plate's axes, from its centre, at samples of half the largest load
-    feet : (n, 2, 3, 2) [m] heel and ball landmarks of both feet, likewise; speeds : (n, 2, 3) [m/s]
+    cop : (n, 2) [m] centre of pressure along the plate's axes, from its centre, at samples of 100 N or more
+    full : (n,) bool, samples of half the largest load
+    feet : (n, 2, 3, 2) [m] heel and ball landmarks of both feet, likewise; speeds : (n, 2, 3) [m/s] over the ground
     """
 
     plate: ForcePlate
     first: int
     stop: int
     cop: NDArray
+    full: NDArray
     feet: NDArray
     speeds: NDArray
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """[s] of the first and of the last sample."""
+        return float(self.plate.times[self.first]), float(self.plate.times[self.stop - 1])
 
     @property
     def offsets(self) -> NDArray:
@@ -91,10 +103,24 @@ class _Loaded:
         along = np.sum((cop[:, None] - heel) * way, axis=-1) / np.maximum(np.sum(way * way, axis=-1), 1e-9)
         return cop[:, None] - heel - np.clip(along, 0.0, 1.3)[..., None] * way  # toes are ahead of the ball
 
+    @property
+    def half(self) -> NDArray:
+        """(2,) [m] from the middle of the plate to just beyond its edges."""
+        return 0.5 * np.ptp((self.plate.corners - self.plate.centre) @ self.plate.axes.T, axis=0) + _EDGE
+
+    @property
+    def apart(self) -> NDArray:
+        """(2,) [m] from the line of each foot to the centre of pressure, the median under full load."""
+        return np.asarray(np.median(np.linalg.norm(self.offsets, axis=-1)[self.full], axis=0))
+
     def is_over(self, side: int) -> NDArray:
-        """(n, 3) bool: points of a foot that are over the plate."""
-        half = 0.5 * np.ptp((self.plate.corners - self.plate.centre) @ self.plate.axes.T, axis=0) + _EDGE
-        return np.asarray(np.all(np.abs(self.feet[:, side]) < half, axis=-1))
+        """(k, 3) bool: points of a foot that are over the plate, under full load."""
+        return np.asarray(np.all(np.abs(self.feet[self.full, side]) < self.half, axis=-1))
+
+    def is_stood_on(self, side: int) -> bool:
+        """Whether a foot stands over the plate for a fifth of the time or more."""
+        stands = self.is_over(side) & (self.speeds[self.full, side] < _MOVING)
+        return bool(stands.any(axis=1).mean() > _STANDING_SHARE)
 
     def time_of(self, end: int) -> float:
         """[s] when the load crosses 20 N at one end of the samples; NaN at the ends of the record."""
@@ -105,30 +131,48 @@ class _Loaded:
         return float(self.plate.times[end - 1] + (LEAST_LOAD - a) / (b - a) / self.plate.rate)
 
 
-def footfalls(motion: Motion) -> list[Footfall]:
-    """Steps of one foot alone on a plate, or on several plates, in the order of their contacts."""
-    return _footfalls(list(_loaded(motion)))
+def feet_on_plates(motion: Motion, events: Events, belt: NDArray) -> tuple[list[Footfall], list[Finding]]:
+    """Steps of one foot alone on a plate, or on several plates, in the order of their contacts; what is wrong.
+
+    That is plates that are moved, turned, late or of another unit, as the feet and the load tell, and loads of no
+    single foot. A plate whose clock is not that of the motion has no steps.
+
+    Parameters
+    ----------
+    motion : Motion
+    events : of the feet alone, as their motion shows them
+    belt : (3,) [m/s] of the ground in the motion's world; zero of a floor
+    """
+    loaded = list(_loaded(motion, belt))
+    late, (steps, others) = _lateness(loaded, events), _footfalls(loaded)
+    weight = GRAVITY * float(segment_masses(motion.body).masses.sum())
+    findings = _plate_findings(motion, loaded, late, weight) if loaded else []
+    return ([] if late else steps), findings or _of_no_foot(others, weight)
 
 
-def footfalls_in_time(motion: Motion, events: Events) -> list[Footfall]:
-    """As `footfalls`; none where the plates' clock is not that of the motion, as its own events (see `Events`) tell."""
-    loaded = list(_loaded(motion))
-    return _footfalls(loaded) if _lateness(loaded, events) is None else []
-
-
-def _footfalls(loaded: Sequence[_Loaded]) -> list[Footfall]:
-    steps: list[tuple[int, float, float, list[_Loaded]]] = []  # side, first and last time under load
-    for one in sorted(loaded, key=lambda one: float(one.plate.times[one.first])):
-        if (side := _side(one)) is None:
-            continue
-        start, stop = float(one.plate.times[one.first]), float(one.plate.times[one.stop - 1])
-        same = next((k for k, (s, _, last, _) in enumerate(steps) if s == side and start <= last), None)
-        if same is None:
-            steps.append((side, start, stop, [one]))
+def _footfalls(loaded: Sequence[_Loaded]) -> tuple[list[Footfall], list[tuple[_Loaded, str]]]:
+    """Steps, and the loads that are none, with the reason."""
+    steps, others = list[tuple[int, list[_Loaded]]](), list[tuple[_Loaded, str]]()
+    for one in sorted(loaded, key=lambda one: one.span):
+        if isinstance(side := _side(one), str):
+            others.append((one, side))
+        elif same := [parts for s, parts in steps if s == side and one.span[0] <= max(p.span[1] for p in parts)]:
+            same[0].append(one)
         else:
-            _, first, last, parts = steps[same]
-            steps[same] = side, min(first, start), max(last, stop), [*parts, one]
-    return [_footfall(side, parts) for side, _, _, parts in steps if _is_whole(side, parts)]
+            steps.append((side, [one]))
+    whole = [_is_whole(side, parts) for side, parts in steps]
+    others += [(one, _PARTLY) for (_, parts), good in zip(steps, whole) if not good for one in parts]
+    return [_footfall(side, parts) for (side, parts), good in zip(steps, whole) if good], others
+
+
+def _of_no_foot(others: Sequence[tuple[_Loaded, str]], weight: float) -> list[Finding]:
+    """One note for each plate on loads, as those of a step, that are of no single foot; `weight` [N]."""
+    said: dict[str, list[str]] = {}
+    for one, why in sorted(others, key=lambda pair: pair[0].span):
+        if one.plate.load[one.first : one.stop].max() > _LOADS[0] * weight:
+            said.setdefault(one.plate.name, []).append(f"from {one.span[0]:.2f} to {one.span[1]:.2f} s ({why})")
+    text = "The force on {} is given to no foot {}. Contacts and toe-offs there are those of the feet."
+    return [Finding("note", "plates", text.format(name, listed(times, 6))) for name, times in said.items()]
 
 
 def _is_whole(side: int, parts: Sequence[_Loaded]) -> bool:
@@ -140,43 +184,45 @@ def _is_whole(side: int, parts: Sequence[_Loaded]) -> bool:
 
 
 def _footfall(side: int, parts: Sequence[_Loaded]) -> Footfall:
-    """A step with its first contact and its last toe-off."""
-    first = min(parts, key=lambda one: one.plate.times[one.first])
-    last = max(parts, key=lambda one: one.plate.times[one.stop - 1])
+    """A step of loads in the order of their begin, with its first contact and its last toe-off."""
+    last = max(parts, key=lambda one: one.span[1])
     names = ", ".join(dict.fromkeys(one.plate.name for one in parts))
-    return Footfall(names, ("left", "right")[side], first.time_of(first.first), last.time_of(last.stop))
+    return Footfall(names, ("left", "right")[side], parts[0].time_of(parts[0].first), last.time_of(last.stop))
 
 
-def _side(one: _Loaded) -> int | None:
-    """0 for the left foot, 1 for the right one; None where it is not sure, or both stand there."""
-    apart = np.median(np.linalg.norm(one.offsets, axis=-1), axis=0)
-    side = int(np.argmin(apart))
-    if apart[side] > _MAX_OFF or apart[1 - side] < apart[side] + _NEARER:
-        return None
-    others = one.is_over(1 - side) & (one.speeds[:, 1 - side] < _MOVING)
-    return None if others.any(axis=1).mean() > 0.2 else side
+def _side(one: _Loaded) -> int | str:
+    """0 for the left foot, 1 for the right one; the reason where it is not sure, or not alone."""
+    apart, side = one.apart, int(np.argmin(one.apart))
+    stands = [one.is_stood_on(foot) for foot in (side, 1 - side)]
+    if all(stands):
+        return "both feet stand there"
+    if np.linalg.norm(one.offsets[:, side], axis=-1).max() > _MAX_OFF:
+        return "it is not under one foot throughout: somebody or something else loads the plate"
+    return "both feet are near" if stands[1] or apart[1 - side] < apart[side] + _NEARER else side
 
 
-def _loaded(motion: Motion) -> Iterator[_Loaded]:
-    """All times in which somebody stands on a plate while the body is known."""
+def _loaded(motion: Motion, belt: NDArray) -> Iterator[_Loaded]:
+    """All times in which somebody stands on a plate while the body is known; `belt` (3,) [m/s] of the ground."""
     names = [f"{side}_{name}" for side in "lr" for name in FOOT]
     if not motion.plates or len(motion) < 2 or any(name not in motion.body.landmarks.names for name in names):
         return
     points = motion.positions(motion.body.landmarks.select(tuple(names)))
-    speeds = np.linalg.norm(np.gradient(points, 1.0 / motion.rate, axis=0), axis=-1)
+    speeds = np.linalg.norm(np.gradient(points, 1.0 / motion.rate, axis=0) - belt, axis=-1)
     table = np.concatenate([points.reshape(len(points), -1), speeds], axis=1)
     for plate in motion.plates:
         load, times = plate.load, plate.times
         edges = np.flatnonzero(np.diff(np.concatenate([[False], load >= LEAST_LOAD, [False]]).astype(int)))
         cop = (plate.centre_of_pressure() - plate.centre) @ plate.axes.T
         for first, stop in edges.reshape(-1, 2):
-            used = first + np.flatnonzero(load[first:stop] > 0.5 * load[first:stop].max())
+            most = load[first:stop].max()
+            used = first + np.flatnonzero(load[first:stop] > min(5.0 * LEAST_LOAD, 0.5 * most))
             used = used[(times[used] >= motion.times[0]) & (times[used] <= motion.times[-1])]
-            if (stop - first) / plate.rate < _MIN_STEP_S or load[first:stop].max() < _MIN_PEAK or not len(used):
+            full = load[used] > 0.5 * most
+            if (stop - first) / plate.rate < _MIN_STEP_S or most < _MIN_PEAK or not full.any():
                 continue
             now = np.column_stack([np.interp(times[used], motion.times, column) for column in table.T])
             at = (now[:, :18].reshape(-1, 2, 3, 3) - plate.centre) @ plate.axes.T
-            yield _Loaded(plate, int(first), int(stop), cop[used], at, now[:, 18:].reshape(-1, 2, 3))
+            yield _Loaded(plate, int(first), int(stop), cop[used], full, at, now[:, 18:].reshape(-1, 2, 3))
 
 
 def standing_mass(trials: Sequence[Sequence[ForcePlate]], body: Body) -> float | None:
@@ -207,7 +253,7 @@ def by_plates(steps: Sequence[Footfall], side: str, end: str, times: NDArray, st
 
     Parameters
     ----------
-    steps : as `footfalls` finds them
+    steps : as `feet_on_plates` finds them
     side : "left" or "right"; end : "contact" or "off"
     times, stds : (N,) [s] of the motion
 
@@ -224,7 +270,7 @@ def by_plates(steps: Sequence[Footfall], side: str, end: str, times: NDArray, st
     return table[:, 0], table[:, 1]
 
 
-def _lateness(loaded: Sequence[_Loaded], events: Events) -> tuple[float, float, int] | None:
+def _lateness(loaded: Sequence[_Loaded], events: Events) -> _Late | None:
     """[s] of the plates' clock beside the motion's, its deviation and the number of events; None if it is right."""
     late = np.array([off for one in loaded for off in _late_events(one, events)])
     spread = 1.48 * float(np.median(np.abs(late - np.median(late)))) if len(late) else np.inf
@@ -233,15 +279,9 @@ def _lateness(loaded: Sequence[_Loaded], events: Events) -> tuple[float, float, 
     return float(np.median(late)), max(spread, 0.012) / float(np.sqrt(len(late))), len(late)
 
 
-def plate_findings(motion: Motion, events: Events) -> list[Finding]:
-    """What is wrong with plates: moved, turned, late, or of another unit, as the feet and the load tell.
-
-    `events`: of the feet alone, as their motion shows them.
-    """
-    out, loaded = list[Finding](), list(_loaded(motion))
-    if not loaded:
-        return out
-    weight = GRAVITY * float(segment_masses(motion.body).masses.sum())
+def _plate_findings(motion: Motion, loaded: Sequence[_Loaded], late: _Late | None, weight: float) -> list[Finding]:
+    """What is wrong with plates: moved, turned, of another unit or late; `weight` [N]."""
+    out = list[Finding]()
     peak = float(total_load(motion.plates, loaded[0].plate.times).max()) / weight
     if not _LOADS[0] < peak < _LOADS[1] and len(loaded) > 1:
         text = f"The largest load on the plates is {peak:.2g} body weights: their forces are not in newtons."
@@ -251,7 +291,7 @@ def plate_findings(motion: Motion, events: Events) -> list[Finding]:
             own = [one for one in loaded if one.plate is plate]
             text, confidence = _misplaced(own) if own else ("", "")
             out += [_finding(text, confidence, "CORNERS, or shift and turn of its [[plate]]")] * bool(text)
-    if (late := _lateness(loaded, events)) is not None:
+    if late is not None:
         apart = f"{late[0]:+.3f} ± {late[1]:.3f} s"
         text = f"The plates' clock is {apart} beside that of the motion: no event is taken of them."
         out.append(_finding(text, f"Likely, by {late[2]} contacts and toe-offs.", "time_offset of its [[plate]]"))
@@ -260,9 +300,8 @@ def plate_findings(motion: Motion, events: Events) -> list[Finding]:
 
 def _late_events(one: _Loaded, events: Events) -> Iterator[float]:
     """[s] from the nearest events of the foot that stands on a plate to those of its load."""
-    apart = np.median(np.linalg.norm(one.offsets, axis=-1), axis=0)
-    if apart.min() < _MAX_OFF:
-        for end, times in zip((one.first, one.stop), events[int(np.argmin(apart))]):
+    if one.apart.min() < _MAX_OFF:
+        for end, times in zip((one.first, one.stop), events[int(np.argmin(one.apart))]):
             if len(times) and np.isfinite(time := one.time_of(end)):
                 yield float(min(time - times, key=abs))
 
@@ -271,13 +310,26 @@ def _finding(text: str, confidence: str, what: str) -> Finding:
     return Finding("doubt", "plates", text, (), confidence, f"Correct {what}.")
 
 
-def stood_on(motion: Motion) -> tuple[ForcePlate, ...]:
-    """The plates on which this person stands: of a recording of several people."""
-    own = {
-        one.plate.name for one in _loaded(motion)
-        if np.median(np.linalg.norm(one.offsets, axis=-1), axis=0).min() < _MAX_OFF
-    }  # fmt: skip
-    return tuple(plate for plate in motion.plates if plate.name in own)
+def stood_on(motion: Motion, others: Sequence[Markers]) -> tuple[tuple[ForcePlate, ...], list[Finding]]:
+    """The plates that this person of a recording loads alone, and notes on those on which another stands, too.
+
+    `others`: markers of the other people, in the motion's world and by its clock.
+    """
+    loaded = [one for one in _loaded(motion, np.zeros(3)) if one.is_stood_on(0) or one.is_stood_on(1)]
+    shared = dict.fromkeys(one.plate.name for one in loaded if any(_is_shared(one, other) for other in others))
+    own = {one.plate.name for one in loaded} - shared.keys()
+    text = "The force on {} is given to nobody: another person stands there at the same time."
+    notes = [Finding("note", "plates", text.format(name)) for name in shared]
+    return tuple(plate for plate in motion.plates if plate.name in own), notes
+
+
+def _is_shared(one: _Loaded, other: Markers) -> bool:
+    """Whether markers of another person stay low over a plate for a fifth of the time that it is loaded."""
+    x = other.positions - one.plate.centre
+    slow = np.linalg.norm(np.gradient(x, 1.0 / other.rate, axis=0), axis=-1) < _MOVING
+    low = slow & np.all(np.abs(x @ one.plate.axes.T) < one.half, axis=-1) & (np.abs(x @ one.plate.normal) < _LOW)
+    during = (other.times >= one.span[0]) & (other.times <= one.span[1])
+    return bool(during.any() and low[during].any(axis=1).mean() > _STANDING_SHARE)
 
 
 def _misplaced(own: list[_Loaded]) -> tuple[str, str]:
@@ -295,7 +347,7 @@ def _misplaced(own: list[_Loaded]) -> tuple[str, str]:
     good = [how for how, after in found.items() if after < min(_MAX_CORRECTED, _CORRECTED_SHARE * before)]
     name, far = own[0].plate.name, f"its centre of pressure is {100 * before:.0f} cm from the nearest foot"
     if good:
-        return f"{name} is {' or '.join(good)}: {far}.", "Likely: so corrected, each step lies under its foot."
+        return f"{name} is {' or '.join(good)}: {far}.", "Likely, if nobody else is there: steps then lie under feet."
     if before < _FOOT_OFFSET:
         return "", ""
     return f"{name} does not lie under the feet: {far}.", "Certain; neither a shift nor a turn explains it."

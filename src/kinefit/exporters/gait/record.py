@@ -14,7 +14,7 @@ from kinefit.bodies.lasting_errors import differ
 from kinefit.bodies.motion import Motion, rotation_between_up
 from kinefit.errors import ObservationError
 from kinefit.exporters.report.cycles import Cycles, find_gait, take_turns
-from kinefit.exporters.report.feet import HEEL, MIN_STRIDE_S, Feet, foot_events
+from kinefit.exporters.report.feet import HEEL, MIN_STRIDE_S, Feet, foot_events, foot_findings
 from kinefit.exporters.report.strides import QUANTITIES, Quantity, step_quantities, stride_quantities
 from kinefit.findings import listed
 
@@ -186,6 +186,7 @@ def _walk(name: str, motion: Motion) -> Walk | str:
         notes.append(f"only the {SIDES[feet.observed.index(True)]} leg was measured; steps and symmetry need both.")
     if feet.backwards:
         notes.append("the person walks backwards.")
+    notes += [found.text for found in foot_findings(motion)]
     return Walk(name, motion, cycles, feet, tuple(notes))
 
 

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import read_table
-from kinefit.bodies.motion import Motion
+from kinefit.bodies.motion import MarkerEvent, Motion
 from kinefit.errors import FileError
-from kinefit.exporters.report.feet import MIN_STRIDE_S, Feet, foot_events, peaks, smoothed
+from kinefit.exporters.report.feet import MIN_STRIDE_S, Feet, foot_event, foot_events, peaks, smoothed
 from kinefit.exporters.report.strides import Quantity, stride_quantities
-from kinefit.observations import MarkerEvent
 
 PERCENT = np.arange(101.0)
 _MAX_STRIDE_S = 3.0  # [s] of a stride: people who hardly walk take 2.5 s
@@ -64,7 +63,7 @@ class Cycles:
     def events(self) -> tuple[MarkerEvent, ...]:
         """Contacts and toe-offs, in the order of their times, named as marker systems do; none of other movements."""
         found = [
-            MarkerEvent(label, float(time), foot.side.capitalize())
+            MarkerEvent(label, float(time), foot.side.capitalize(), icon=1 + (label == "Foot Off"))
             for foot in ((self.feet.left, self.feet.right) if self.feet else ())
             for label, times in (("Foot Strike", foot.contacts), ("Foot Off", foot.offs)) for time in times
         ]  # fmt: skip
@@ -141,6 +140,17 @@ def find_gait(motion: Motion) -> Cycles | None:
     if min(alike, default=1.0) < _MIN_CORRELATION or not take_turns(feet):
         return None
     return Cycles("gait", tuple(sides), float(np.mean(alike)) if alike else np.nan, feet) if sides else None
+
+
+def events_of(motion: Motion) -> tuple[MarkerEvent, ...]:
+    """Contacts and toe-offs found in a walk, and the other events of the recording; all of those where it is no gait.
+
+    In the order of their times.
+    """
+    if (gait := find_gait(motion)) is None:
+        return motion.events
+    others = (event for event in motion.events if foot_event(event) is None)
+    return tuple(sorted((*gait.events, *others), key=lambda event: event.time))
 
 
 def _repeated(motion: Motion) -> Cycles | None:

@@ -2,34 +2,42 @@
 
 A foot swings where its heel goes from farthest behind the pelvis to farthest ahead of it (Zeni, Richards and Higginson
 2008, "Two simple methods for determining gait events during treadmill and overground walking using kinematic data",
-Gait & Posture 27:710-714). It stands where heel or ball are slow over the ground (as Ghoussayni et al. 2004, Gait &
-Posture 20:266-272, with a share of the swing's speed in place of 50 mm/s): contact is where the first of them falls
-below a share of its highest speed in the swing, toe-off where the ball rises above another. A treadmill's belt is
-ground, too: its velocity is that of what stands on it. Ahead is where the pelvis goes: of who walks backwards, behind.
+Gait & Posture 27:710-714). It stands where heel or toes are slow over the ground (as Ghoussayni et al. 2004, Gait &
+Posture 20:266-272, with a share of the swing's speed in place of 50 mm/s): contact is where the first of heel and ball
+falls below a share of its highest speed in the swing, toe-off where the tip of the toes, which leaves last and upwards,
+rises above another. A treadmill's belt is ground, too: its velocity is that of what stands on it. Ahead is where the
+pelvis goes: of who walks backwards, behind.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.motion import Motion, rotation_between_up
-from kinefit.exporters.gait.plates import Footfall, by_plates, footfalls_in_time, plate_findings
+from kinefit.bodies.motion import MarkerEvent, Motion, rotation_between_up
+from kinefit.exporters.gait.plates import CONTACT_STD_S, Footfall, by_plates, feet_on_plates
 from kinefit.findings import Finding
 
 LEAST_STEP = 0.12  # share of the stature that a foot travels to and fro at least: shuffling 20 cm strides of an adult
 MIN_STRIDE_S = 0.4  # [s]: sprinters take 0.45 s
-HEEL, BALL = "heel", ("metatarsal_phalanx_1", "metatarsal_phalanx_5")  # landmarks of a foot, after "l_" or "r_"
-_CONTACT_SHARE, _OFF_SHARE = 0.09, 0.22  # of the swing's highest speed. Chosen on three children (HC002D, HC036A,
-# HC050A of the shared gait recordings), so that neither plates nor the files' own events are missed by more than 8 ms
-_CONTACT_STD_S, _OFF_STD_S = 0.01, 0.009  # of what is so found, there, against plates
+BELT_STD = 0.013  # [m/s] of a belt's velocity: the root mean square in ten walks of four people, as if on a belt
+HEEL, BALL, TOE = "heel", ("metatarsal_phalanx_1", "metatarsal_phalanx_5"), "digit_1"  # of a foot, after "l_", "r_"
+_CONTACT_SHARE, _OFF_SHARE = 0.1, 0.18  # of the swing's highest speed: no error against plates in the mean of five
+# people (HC002D, HC036A and HC050A, the adult and the sprinter of forces_nimblephysics), each of whom counts once
+_CONTACT_STD_S, _OFF_STD_S = 0.013, 0.0105  # of the next person: 7.8 and 5.5 ms between these people, as Student's t
+# of five predicts another, 5.6 and 6.5 ms within one
+_MARKED_STD_S = 0.009  # of laboratories' own events: they differ by 12.5 ms from ours, which are right to 8.5 ms, there
+_MARKED_SIGMAS = 3.0  # of both together, beyond which they contradict each other
+_AROUND_S = 0.15  # [s] before the first and after the last event of a foot: half a stride of a sprinter, and less
+_LABELS = {"foot strike": "contacts", "heel strike": "contacts", "foot off": "offs", "toe off": "offs"}
 _ROUGH_STD_S = 0.05  # of the extreme place alone, which is 49 ms early
 _WAY_HZ, _SPEED_HZ = 6.0, 12.0  # what is faster is noise: walking has 99 % of its power below 6 Hz (Winter)
 _BEFORE_S, _AFTER_S = 0.1, 0.25  # [s] of the extreme place, within which the event is sought
-_LEAST_BELT = 0.15  # [m/s] of what stands: less is a floor
+_LEAST_BELT, _FLAT_SHARE = 0.15, 0.3  # [m/s] of what stands: less is a floor; of the frames, in which it lies flat
 _LEAST_BACK = 0.2  # [m/s] of a pelvis that moves backwards over the ground
 _MIN_SEEN_SHARE = 0.5  # of the frames in which a leg is measured; with less it has no events
 
@@ -71,42 +79,114 @@ class Feet:
     backwards: bool = False
 
 
-def foot_events(motion: Motion, *, plates: bool = True) -> Feet | None:
-    """Events of the left and of the right foot; None where the body has no heels, balls of the feet or hips.
+@dataclass(frozen=True, eq=False)
+class Footing:
+    """What feet and force plates tell together.
 
-    What force plates measured counts in place of what the feet show; with `plates` false it is left aside. Steps that
-    are shorter than 12 % of the stature are left out, and what is next to the ends of the motion.
+    Parameters
+    ----------
+    feet : events of both feet, those of plates in place of what the feet show
+    steps : of one foot alone on plates
+    findings : what is wrong with plates, and which events of the recording contradict `feet`
     """
-    names = [f"{s}_{n}" for s in "lr" for n in ("hip", HEEL, *BALL)]
+
+    feet: Feet
+    steps: tuple[Footfall, ...]
+    findings: tuple[Finding, ...]
+
+
+_FOOTINGS: WeakKeyDictionary[Motion, Footing | None] = WeakKeyDictionary()  # of motions that are still in use
+
+
+def footing(motion: Motion) -> Footing | None:
+    """Feet and plates of a motion, found once; None where the body has no heels, toes or hips.
+
+    Steps that are shorter than 12 % of the stature are left out, and what is next to the ends of the motion.
+    """
+    if motion not in _FOOTINGS:
+        feet = feet_alone(motion)
+        _FOOTINGS[motion] = None if feet is None else _with_files(motion, feet)
+    return _FOOTINGS[motion]
+
+
+def foot_events(motion: Motion) -> Feet | None:
+    """Events of both feet, as `footing` finds them."""
+    found = footing(motion)
+    return found.feet if found else None
+
+
+def _with_files(motion: Motion, feet: Feet) -> Footing:
+    """Feet with what the plates and the files of the recording say of them."""
+    belt = rotation_between_up(motion.up, "y").T @ [feet.belt[0], 0.0, feet.belt[1]]
+    steps, findings = feet_on_plates(motion, [(f.contacts, f.offs) for f in (feet.left, feet.right)], belt)
+    feet = replace(feet, left=_with_plates(feet.left, steps), right=_with_plates(feet.right, steps))
+    return Footing(feet, tuple(steps), (*findings, *marked_findings(motion.events, feet)))
+
+
+def feet_alone(motion: Motion) -> Feet | None:
+    """Events of both feet as they show them alone, without plates; None as in `footing`."""
+    names = [f"{s}_{n}" for s in "lr" for n in ("hip", HEEL, *BALL, TOE)]
     if any(name not in motion.body.landmarks.names for name in names) or len(motion) < 3:
         return None
     upright = motion.positions(motion.body.landmarks.select(tuple(names))) @ rotation_between_up(motion.up, "y").T
-    hips, heels, first, fifth = np.moveaxis(upright.reshape(len(motion), 2, 4, 3), 2, 0)
-    feet = np.stack([heels, 0.5 * (first + fifth)], axis=2)  # (F, side, heel and ball, 3)
+    hips, heels, first, fifth, toes = np.moveaxis(upright.reshape(len(motion), 2, 5, 3), 2, 0)
+    feet = np.stack([heels, 0.5 * (first + fifth), toes], axis=2)  # (F, side, heel, ball and toe, 3)
     across = hips[:, 1] - hips[:, 0]
     forward = np.cross([0.0, 1.0, 0.0], across)
     forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-9)
     ahead = np.einsum("fspi,fi->fsp", feet - hips.mean(axis=1)[:, None, None], forward)
-    velocity = np.gradient(smoothed(feet, motion.rate, _SPEED_HZ), 1.0 / motion.rate, axis=0)[..., ::2]
+    velocity = np.gradient(smoothed(feet, motion.rate, _SPEED_HZ), 1.0 / motion.rate, axis=0)
     pelvis, observed = hips.mean(axis=1), _observed(motion)
     measured = np.flatnonzero(observed)
-    belt = _belt(feet[:, measured], velocity[:, measured], pelvis[:, ::2], motion.rate)
-    speed = np.linalg.norm(velocity - belt, axis=-1)
+    belt = _belt(feet[:, measured, :2], velocity[:, measured, :2, ::2], pelvis[:, ::2], motion.rate)
+    speed = np.linalg.norm(velocity - [belt[0], 0.0, belt[1]], axis=-1)
     way = np.gradient(smoothed(pelvis, motion.rate), 1.0 / motion.rate, axis=0)[:, ::2] - belt
     backwards = bool(np.median(np.sum(way * forward[:, ::2], axis=1)) < -_LEAST_BACK)
     least = LEAST_STEP * (motion.body.stature or 1.7)
     ahead = (-ahead if backwards else ahead) * observed[:, None]  # of a leg that was not measured nothing is known
     left, right = (_events(motion, name, ahead[:, s], speed[:, s], least) for s, name in enumerate(("left", "right")))
-    events = [(foot.contacts, foot.offs) for foot in (left, right)]
-    steps = footfalls_in_time(motion, events) if plates and motion.plates else []
-    sides = (_with_plates(left, steps), _with_plates(right, steps))
-    return Feet(*sides, belt, (bool(observed[0]), bool(observed[1])), backwards)
+    return Feet(left, right, belt, (bool(observed[0]), bool(observed[1])), backwards)
 
 
-def plate_faults(motion: Motion) -> list[Finding]:
-    """What is wrong with the force plates of a motion, by what its feet show alone."""
-    feet = foot_events(motion, plates=False) if motion.plates else None
-    return plate_findings(motion, [(f.contacts, f.offs) for f in (feet.left, feet.right)]) if feet else []
+def foot_findings(motion: Motion) -> tuple[Finding, ...]:
+    """What `footing` finds wrong with force plates and with the events of the recording."""
+    found = footing(motion)
+    return found.findings if found else ()
+
+
+def foot_event(event: MarkerEvent) -> tuple[str, str] | None:
+    """Side and kind, "contacts" or "offs", of an event of a recording; None of any other."""
+    side, kind = event.context.lower(), _LABELS.get(event.label.lower())
+    return (side, kind) if kind and side in ("left", "right") else None
+
+
+def marked_findings(events: Iterable[MarkerEvent], feet: Feet) -> list[Finding]:
+    """Events of a recording's files that lie farther from those found than three standard deviations of both."""
+    wrong: dict[str, list[str]] = {}
+    for event in events:
+        if (known := foot_event(event)) and (text := _contradiction(event.time, *known, feet)):
+            wrong.setdefault(event.source or "the recording", []).append(text)
+    text = "Events of {} contradict feet and plates: {}. Those found are used."
+    sure, remedy = "Likely: beyond three standard deviations of both.", "Correct the events or the clock of that file."
+    return [Finding("doubt", "events", text.format(f, "; ".join(of)), (), sure, remedy) for f, of in wrong.items()]
+
+
+def _contradiction(time: float, side: str, kind: str, feet: Feet) -> str:
+    """How an event of a foot at a time [s] contradicts those found; "" where it does not, or none can be known."""
+    foot, other = (feet.left, feet.right) if side == "left" else (feet.right, feet.left)
+    both = np.concatenate([foot.contacts, foot.offs])
+    times, stds = (foot.contacts, foot.contact_std) if kind == "contacts" else (foot.offs, foot.off_std)
+    if not len(times) or not both.min() - _AROUND_S < time < both.max() + _AROUND_S:
+        return ""
+    marked = f"{side} {'contact' if kind == 'contacts' else 'toe-off'} at {time:.3f} s"
+    near = int(np.argmin(np.abs(times - time)))
+    late, sure = float(times[near] - time), _MARKED_SIGMAS * float(np.hypot(stds[near], _MARKED_STD_S))
+    if abs(late) <= sure:
+        return ""
+    if np.min(np.abs(getattr(other, kind) - time), initial=np.inf) < sure:
+        return f"{marked} (there the {other.side} foot has it)"
+    by = "by a plate " if stds[near] == CONTACT_STD_S else ""
+    return f"{marked} (found {by}{abs(late):.3f} ± {2.0 * stds[near]:.3f} s {'later' if late > 0 else 'earlier'})"
 
 
 def _with_plates(foot: FootEvents, steps: Sequence[Footfall]) -> FootEvents:
@@ -134,16 +214,16 @@ def _belt(feet: NDArray, velocity: NDArray, pelvis: NDArray, rate: float) -> NDA
     pelvis : (F, 2) [m] along x and z; rate : float [Hz]
     """
     lower = np.argmin(feet[..., 1].mean(axis=2), axis=1)  # of two feet the one that stands
-    frames = np.arange(len(feet))
-    slower = np.argmin(np.linalg.norm(velocity[frames, lower], axis=-1), axis=1)
-    median = np.median(velocity[frames, lower, slower], axis=0)
+    ends = velocity[np.arange(len(feet)), lower]
+    apart = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)  # a foot that lies flat goes with the ground as a whole
+    median = np.median(ends[apart <= np.quantile(apart, _FLAT_SHARE)].mean(axis=1), axis=0)
     speed = float(np.linalg.norm(median))
     moved = float(np.linalg.norm(pelvis[-1] - pelvis[0])) * rate / (len(pelvis) - 1)
     return np.asarray(median if speed > max(_LEAST_BELT, 2.0 * moved) else np.zeros(2))
 
 
 def _events(motion: Motion, side: str, ahead: NDArray, speed: NDArray, least: float) -> FootEvents:
-    """Of a foot whose heel and ball are so far ahead (F, 2) [m], at a speed (F, 2) [m/s] over the ground."""
+    """Of a foot whose heel, ball and toe are so far ahead (F, 3) [m], at a speed (F, 3) [m/s] over the ground."""
     apart, rate = round(MIN_STRIDE_S * motion.rate), motion.rate
     way = smoothed(ahead, rate, _WAY_HZ)
     strikes, leaves = (peaks(sign * way[:, 0], least, apart) for sign in (1.0, -1.0))
@@ -162,7 +242,7 @@ def _events(motion: Motion, side: str, ahead: NDArray, speed: NDArray, least: fl
 def _standing(speed: NDArray, extreme: int, rate: float, is_contact: bool) -> float | None:
     """Frame, with its fraction, where a foot begins or ends to stand near the frame of its extreme place.
 
-    `speed` (F, 2) [m/s] of heel and ball over the ground.
+    `speed` (F, 3) [m/s] of heel, ball and toe over the ground.
     """
     swing = slice(extreme, extreme + round(MIN_STRIDE_S * rate))
     if is_contact:  # the swing is before; time runs backwards for toe-off alone
@@ -171,7 +251,7 @@ def _standing(speed: NDArray, extreme: int, rate: float, is_contact: bool) -> fl
         return None
     share = _CONTACT_SHARE if is_contact else _OFF_SHARE
     found = []
-    for v in (speed.T if is_contact else speed[:, 1:].T):
+    for v in (speed[:, :2] if is_contact else speed[:, 2:]).T:
         limit = share * v[swing].max()
         if is_contact:
             first, last = swing.start + int(np.argmax(v[swing])) + 1, extreme + round(_AFTER_S * rate)

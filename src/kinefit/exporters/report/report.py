@@ -295,8 +295,8 @@ def _cycles(motion: Motion, cycles: Cycles | None, norms: Norms) -> list[p.Html]
     counts = listed([f"{len(s.spans)} {'' if s.name == 'both' else s.name + ' '}cycles" for s in cycles.sides])
     if cycles.kind == "gait":
         text = (
-            f"Gait: {counts}, from contact to contact of a foot (0–100 %). A foot stands while its heel or ball is "
-            "slow over the ground. The dashed vertical line is toe-off. "
+            f"Gait: {counts}, from contact to contact of a foot (0–100 %). A foot stands from where its heel or ball "
+            "gets slow over the ground until its toes leave it. The dashed vertical line is toe-off. "
         )
     else:
         text = f"A repeated movement: {counts}, from one extreme posture to the next of the same kind. "

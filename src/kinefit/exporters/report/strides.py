@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import PointSet
 from kinefit.bodies.lasting_errors import LastingErrors
 from kinefit.bodies.motion import BRIEF_S, Motion, rotation_between_up
-from kinefit.exporters.report.feet import BALL, HEEL, Feet, FootEvents
+from kinefit.exporters.report.feet import BALL, BELT_STD, HEEL, Feet, FootEvents
 
 QUANTITIES = (
     "stride time [s]", "cadence [steps/min]", "stance [% of cycle]", "swing [% of cycle]",
@@ -214,7 +214,8 @@ class _Ground:
             brief = np.maximum(brief - np.square(lasting).sum(axis=1), 0.0)
         alike = (owners[:, None] == owners) * np.exp(-apart / BRIEF_S)
         together += alike * np.sqrt(np.outer(brief, brief))
-        return float(np.sqrt(max(weights @ together @ weights, 0.0)))
+        carried = BELT_STD * float(weights @ motion.times[frames]) if self._belt.any() else 0.0
+        return float(np.sqrt(max(weights @ together @ weights, 0.0) + carried**2))
 
     def _factors(
         self, lasting: LastingErrors, points: Sequence[PointSet], frames: NDArray, world: NDArray

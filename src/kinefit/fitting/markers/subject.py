@@ -147,7 +147,9 @@ def split_people(markers: Markers) -> dict[str, Markers]:
                 file=markers.source or None, remedy="Name every marker of a person once.",
             )
         residual = None if markers.residual is None else markers.residual[:, indices]
-        out[person] = replace(markers, names=labels, positions=markers.positions[:, indices], residual=residual)
+        x, others = markers.positions[:, indices], people.keys() - {person}
+        events = tuple(event for event in markers.events if event.subject not in others)
+        out[person] = replace(markers, names=labels, positions=x, residual=residual, events=events)
     return out
 
 

@@ -220,4 +220,4 @@ def fit_markers(
         person, TrackSettings(marker_loss=loss), Estimation(smooth=smooth), each=not smooth, progress=progress
     )
     up = up or markers.up or axis_of(motion.Ts_world_root[:, :3, 1].mean(axis=0))
-    return replace(motion, body=body, up=up, plates=markers.plates)
+    return replace(motion, body=body, up=up, plates=markers.plates, events=markers.events)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kinefit import observations
 from kinefit._arguments import checked
-from kinefit.bodies.motion import UP_AXES
+from kinefit.bodies.motion import UP_AXES, MarkerEvent
 from kinefit.errors import FileError, ObservationError, TakeError, command, located
 from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
@@ -83,6 +83,8 @@ class Observations:
         Static trial of each of `markers`.
     plates : tuple of ForcePlate
         Of marker files and of `take.plates`, in the take's world and by its clock.
+    events : tuple of MarkerEvent
+        Of marker files, likewise.
     """
 
     rate: float
@@ -101,6 +103,7 @@ class Observations:
     first_time: float = 0.0
     static_markers: tuple[observations.Markers | None, ...] = ()
     plates: tuple[ForcePlate, ...] = ()
+    events: tuple[MarkerEvent, ...] = ()
 
     if not TYPE_CHECKING:
 
@@ -199,6 +202,7 @@ def load_observations(take: entries.Take, *, exteriors: bool = True) -> Observat
         streams[stream] = times + of_cameras.offset(source.camera)
         keypoints.append((read, streams[stream]))
     plates = [plate.shifted(e.time_offset) for e, m in zip(take.markers, markers) for plate in m.plates]
+    events = [replace(one, time=one.time + e.time_offset) for e, m in zip(take.markers, markers) for one in m.events]
     of_files = entries.read_each(take, take.plates, partial(_read_plates, up=take.up))
     plates += [plate for read in of_files for plate in read.plates]
     notes += [f"[[plate]]: {text}" for read in of_files for text in read.notes]
@@ -258,7 +262,7 @@ def load_observations(take: entries.Take, *, exteriors: bool = True) -> Observat
     cameras += [video.camera for video in depth if video.camera is not None]
     return Observations(
         rate=rate, frames=frames, rig=Rig(tuple(cameras)) if cameras else None,
-        markers=markers, static_markers=static_markers, plates=_named_apart(plates),
+        markers=markers, static_markers=static_markers, plates=_named_apart(plates), events=tuple(events),
         keypoints=tuple(_cut(*k, rate, frames, entry) for k, entry in zip(keypoints, take.keypoints)),
         videos={e.name: e.video for e in take.cameras if e.video is not None}, images=images,
         depth=depth, clouds=clouds, sensors=sensors, skin=skin,

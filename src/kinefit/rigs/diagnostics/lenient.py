@@ -104,7 +104,7 @@ def too_few(take: Take, seen: Observations, cameras: int) -> list[Finding]:
     if seen.depth and not (take.cameras or take.markers):
         return []
     if take.markers and not take.cameras:
-        return [Finding("note", "load", "Markers alone: their labels are checked, and nothing else.")]
+        return [Finding("note", "load", "Markers alone: labels, plates and events are checked, and nothing else.")]
     if take.sensors and not take.keypoints and not cameras:
         return [Finding("note", "load", "No keypoints: each sensor is checked by itself, and nothing else.")]
     text = f"Keypoints of {cameras} camera(s): a check needs those of two or more."

@@ -10,7 +10,7 @@ import numpy as np
 
 from kinefit._threads import cores
 from kinefit.bodies import Body, load_body
-from kinefit.errors import CalibrationError, TakeError, located
+from kinefit.errors import CalibrationError, TakeError, command, located
 from kinefit.fitting.tracking.recording import Recording
 from kinefit.fitting.tracking.run import tracker_of
 from kinefit.fitting.tracking.take_recording import posed_start, recording_of
@@ -72,7 +72,7 @@ def live_session(
     elif take.cameras and not (take.keypoints or take.other_sensors):
         opened = _videos(take, body, speed, threads, tell)
     else:
-        opened = _recorded(take, body, speed)
+        opened = _recorded(take, body, speed, tell)
     recording, settings = opened.recording, settings_of(take)
     trial = trial_of(take)
     body = opened.body if trial is None else trial.body
@@ -93,9 +93,12 @@ def live_session(
     )  # fmt: skip
 
 
-def _recorded(take: Take, body: Body, speed: float) -> Opened:
+def _recorded(take: Take, body: Body, speed: float, tell: Tell) -> Opened:
     """Replay of a take's recording, step by step."""
     seen = with_names(take, load_observations(take))
+    if seen.plates:
+        use = f"{command('track', take.path)} takes contacts, forces and the mass from them"
+        tell(f"Force plates have no part in a live session: {use}.")
     recording, body = recording_of(take, replace(seen, keypoints=()), body)
     return Opened(recording, body, (Replay(recording, seen.keypoints, speed=speed),))
 
