@@ -9,7 +9,7 @@ import pytest
 from kinefit.errors import FileError, ObservationError
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.videos.video import Video, VideoSet
+from kinefit.readers.videos.video import Video, common_frames
 
 
 def draw(folder, numbers, ending=".png", size=(48, 32)):
@@ -88,10 +88,10 @@ def test_what_is_wrong_with_images_is_told(tmp_path):
 
 
 def test_folders_go_in_step(tmp_path):
-    paths = {name: draw(tmp_path / name, range(6)) for name in ("a", "b")}
-    with VideoSet(paths, {"b": 0.1}, rate=20.0, frames=(2, 6)) as videos:
-        at = videos.read(0)
-        assert (at["a"][0, 0, 0], at["b"][0, 0, 0]) == (10, 0)
+    with Video(draw(tmp_path / "a", range(6)), rate=20.0) as a, Video(draw(tmp_path / "b", range(6)), rate=20.0) as b:
+        first, _ = common_frames({"a": a.times, "b": b.times + 0.1}, 20.0, (2, 6))
+        at = a.read(a.frame_at(first / 20.0)), b.read(b.frame_at(first / 20.0 - 0.1))
+        assert [image[0, 0, 0] for image in at] == [10, 0]
 
 
 def test_a_take_of_folders_has_the_rate_of_the_take(tmp_path):

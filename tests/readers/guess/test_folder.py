@@ -16,8 +16,9 @@ from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.guess.folder import guess_take
 from kinefit.readers.guess.names import trials
 from kinefit.readers.landmarks.keypoint_sets import KEYPOINT_SETS
+from kinefit.readers.take.cameras import read_rig
 from kinefit.readers.take.file import read_take
-from kinefit.readers.take.load import load_observations, read_rig
+from kinefit.readers.take.load import load_observations
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
 
 SIZE = (272, 480)
