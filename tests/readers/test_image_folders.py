@@ -9,7 +9,7 @@ import pytest
 from kinefit.errors import FileError, ObservationError
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.videos.video import Video
+from kinefit.readers.videos.video import Video, common_frames
 
 
 def draw(folder, numbers, ending=".png", size=(48, 32)):
@@ -85,6 +85,13 @@ def test_what_is_wrong_with_images_is_told(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileError, match="no images here"):
         Video(tmp_path / "empty", rate=30.0)
+
+
+def test_folders_go_in_step(tmp_path):
+    with Video(draw(tmp_path / "a", range(6)), rate=20.0) as a, Video(draw(tmp_path / "b", range(6)), rate=20.0) as b:
+        first, _ = common_frames({"a": a.times, "b": b.times + 0.1}, 20.0, (2, 6))
+        at = a.read(a.frame_at(first / 20.0)), b.read(b.frame_at(first / 20.0 - 0.1))
+        assert [image[0, 0, 0] for image in at] == [10, 0]
 
 
 def test_a_take_of_folders_has_the_rate_of_the_take(tmp_path):

@@ -14,7 +14,7 @@ from kinefit.readers import assets
 @pytest.fixture
 def no_overlays(monkeypatch):
     """Overlays are the slow part, and test_track.py sees to them."""
-    monkeypatch.setattr("kinefit.takes.batch.one.write_overlays", lambda *args, **more: None)
+    monkeypatch.setattr("kinefit.takes.batch.results.write_overlays", lambda *args, **more: None)
 
 
 def run(*args):

@@ -390,7 +390,7 @@ def test_ctrl_c_during_overlays_lists_what_is_whole(take, tmp_path, monkeypatch)
     def interrupted(*args, **more):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("kinefit.takes.batch.one.write_overlays", interrupted)
+    monkeypatch.setattr("kinefit.takes.batch.results.write_overlays", interrupted)
     told = run("track", take, "--out", tmp_path / "out", "--formats", "bvh")
     assert told.exit_code == 130
     assert str(tmp_path / "out" / "motion.bvh") in told.stdout
