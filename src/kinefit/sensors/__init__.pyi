@@ -1,0 +1,6 @@
+"""Public names: Sensors, and what one's own needs."""
+
+from kinefit.sensors.base import Sensor as Sensor, Measurement as Measurement, RowsOf as RowsOf, Hints as Hints
+from kinefit.sensors.base import Unknown as Unknown
+from kinefit.sensors.scene import Scene as Scene
+from kinefit.sensors.settings import TrackSettings as TrackSettings
