@@ -15,7 +15,7 @@ import warnings  # noqa: E402
 from importlib import import_module  # noqa: E402
 from typing import Any  # noqa: E402
 
-from kinefit._doors import names_of, room_with  # noqa: E402
+from kinefit._doors import names_of, public_names  # noqa: E402
 from kinefit._moved import MovedFinder, moved  # noqa: E402
 
 sys.meta_path.insert(0, MovedFinder())
@@ -33,7 +33,7 @@ def __getattr__(name: str) -> Any:
         return getattr(import_module(module), attribute)
     if new := moved(f"kinefit.{name}"):
         return import_module(new)
-    if room := room_with(name):
+    if room := public_names().get(name):
         warnings.warn(f"kinefit.{name} is {room}.{name} now; the old name ends with 0.4", FutureWarning, stacklevel=2)
         return getattr(import_module(room), name)
     raise AttributeError(f"module 'kinefit' has no attribute '{name}'")

@@ -39,10 +39,12 @@ def door_of(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]
     return get, lambda: sorted(names_of(package))
 
 
-def room_with(name: str) -> str:
-    """The package of kinefit that has this public name, empty if none has: where names of 0.2 went."""
+@cache
+def public_names() -> dict[str, str]:
+    """{public name: package that has it}: the door's own, then those of rooms, from below."""
+    found = dict.fromkeys(names_of("kinefit"), "kinefit")
     for room in ROOMS:
-        if name in names_of(f"kinefit.{room}"):
-            return f"kinefit.{room}"
-    public = (f"kinefit.{room}" for room in ("bodies", "observations", "exporters", "simulation"))
-    return next((package for package in public if name in import_module(package).__all__), "")
+        package = import_module(f"kinefit.{room}")
+        names = vars(package).get("__all__", names_of(package.__name__))
+        found = dict.fromkeys(names, package.__name__) | found
+    return found

@@ -1,13 +1,13 @@
 """Public names: Fits of frames, people and takes."""
 
-from kinefit.fitting.tracking.recording import Recording as Recording
-from kinefit.fitting.tracking.video import track as track
-from kinefit.fitting.tracking.tracker import Tracker as Tracker
 from kinefit.fitting.frame.results import FrameResult as FrameResult
-from kinefit.fitting.tracking.markers import fit_markers as fit_markers
-from kinefit.fitting.markers.subject import fit_marker_subject as fit_marker_subject
 from kinefit.fitting.markers.poses import split_people as split_people
-from kinefit.fitting.subject.fit import fit_subject as fit_subject
-from kinefit.fitting.subject.sensor_parameters import OwnUnknowns as OwnUnknowns
+from kinefit.fitting.markers.subject import fit_marker_subject as fit_marker_subject
 from kinefit.fitting.smoothing.online.fixed_lag import FixedLag as FixedLag
 from kinefit.fitting.smoothing.online.lag_frame import KnownNoise as KnownNoise
+from kinefit.fitting.subject.fit import fit_subject as fit_subject
+from kinefit.fitting.subject.sensor_parameters import OwnUnknowns as OwnUnknowns
+from kinefit.fitting.tracking.markers import fit_markers as fit_markers
+from kinefit.fitting.tracking.recording import Recording as Recording
+from kinefit.fitting.tracking.tracker import Tracker as Tracker
+from kinefit.fitting.tracking.video import track as track
