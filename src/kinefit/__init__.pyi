@@ -38,7 +38,7 @@ from kinefit.rigs.people.calibrate import calibrate_people as calibrate_people
 from kinefit.rigs.refine.refine import refine as refine
 
 # A sensor of one's own, errors
-from kinefit.sensors.base import Sensor as Sensor, Measurement as Measurement, RowsOf as RowsOf
+from kinefit.sensors.base import Measurement as Measurement, RowsOf as RowsOf, Sensor as Sensor
 from kinefit.readers.take.kinds import SensorKind as SensorKind
 from kinefit.solving.rows import Rows as Rows
 from kinefit.errors import KinefitError as KinefitError
