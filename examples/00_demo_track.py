@@ -35,8 +35,8 @@ def main(take_file=None, out="kinefit-example"):
     knee = motion.segment_poses()[:, motion.body.tree.segment("shank_r"), :3, 3]
     print(f"the right knee moved within {np.ptp(knee, axis=0).round(2)} m (x, y, z; {motion.up} is up)")
 
-    kinefit.write_bvh(motion, f"{out}/motion.bvh")
-    kinefit.write_csv(motion, f"{out}/tables")
+    kinefit.exporters.write_bvh(motion, f"{out}/motion.bvh")
+    kinefit.exporters.write_csv(motion, f"{out}/tables")
     print(f"written: {out}/motion.bvh, {out}/tables")
     return motion
 

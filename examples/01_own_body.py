@@ -61,9 +61,9 @@ def main(seed=0, noise=0.002):
             kinefit.solving.correspondences.prior_rows(lamp, state),  # a weak prior for what nothing observes
         )
 
-    fit = kinefit.levenberg_marquardt(lamp, lamp.rest_state(), make_rows)
+    fit = kinefit.solving.levenberg_marquardt(lamp, lamp.rest_state(), make_rows)
     # The normal matrix has six rows for the root in front; this root is fixed.
-    std = np.degrees(kinefit.covariance(fit.equations).std[6:])
+    std = np.degrees(kinefit.solving.covariance(fit.equations).std[6:])
     found = np.degrees(fit.state.angles)
     print(f"{lamp.name}: fitted in {fit.iterations} iterations")
     for name, a, s, t in zip(lamp.tree.coordinates, found, std, np.degrees(truth.angles)):

@@ -48,11 +48,11 @@ def main(seed=0, noise_px=1.0):
             rows = [pixels, kinefit.solving.correspondences.prior_rows(arm, state)]
             return rows + [sphere_rows(arm, state, grip, anchor, length)] * with_rope
 
-        fit = kinefit.levenberg_marquardt(arm, arm.rest_state(shoulder), make_rows)
+        fit = kinefit.solving.levenberg_marquardt(arm, arm.rest_state(shoulder), make_rows)
         wrist = arm.landmarks.select(("r_wrist",))
         error = np.linalg.norm(arm.positions(fit.state, wrist) - arm.positions(truth, wrist))
-        spread = kinefit.covariance(fit.equations)
-        std = np.linalg.norm(kinefit.joint_std(arm, fit.state, spread)[arm.tree.segment("hand_r")])
+        spread = kinefit.solving.covariance(fit.equations)
+        std = np.linalg.norm(kinefit.solving.joint_std(arm, fit.state, spread)[arm.tree.segment("hand_r")])
         errors[name] = (error, std)
         print(f"{name:<16} wrist off by {1000 * error:5.1f} mm, one standard deviation {1000 * std:5.1f} mm")
     return errors

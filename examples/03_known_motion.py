@@ -9,11 +9,12 @@ import sys
 import numpy as np
 
 import kinefit
-from kinefit import evaluation, simulation
+from kinefit import simulation
+from kinefit.simulation import evaluation
 
 
 def main(bvh=None, frames=60, noise_px=3.0):
-    truth = kinefit.retarget(kinefit.read_bvh(bvh), rate=30.0) if bvh else simulation.squat_and_wave()
+    truth = simulation.retarget(kinefit.readers.read_bvh(bvh), rate=30.0) if bvh else simulation.squat_and_wave()
     truth = simulation.cut(truth, 0, frames)
     rig = simulation.studio_rig(truth, cameras=4)
     seen = simulation.simulate_keypoints(truth, rig, "MEDIAPIPE_33", noise_px=noise_px, outliers=0.1, missing=0.1)

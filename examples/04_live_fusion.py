@@ -30,8 +30,8 @@ def main(frames=30, seed=0):
     for i in range(min(frames, len(truth))):
         uv = camera.project(truth.positions(points)[i]) + 2.0 * rng.standard_normal((len(JOINTS), 2))
         seen = [
-            kinefit.DepthFrame("kinect", truth.times[i], video.frame(i).depth),
-            kinefit.KeypointFrame("kinect", truth.times[i], JOINTS, uv, np.full(len(JOINTS), 0.9)),
+            kinefit.observations.DepthFrame("kinect", truth.times[i], video.frame(i).depth),
+            kinefit.observations.KeypointFrame("kinect", truth.times[i], JOINTS, uv, np.full(len(JOINTS), 0.9)),
         ]
         result = tracker.update(seen)
         x = person.body.positions(result.state, points)

@@ -35,7 +35,7 @@ def main(labelled=None, points=None, out="kinefit-example"):
         taught, take = simulated()
 
     model = kinefit.learn_model(taught, name="subject")
-    for finding in kinefit.training_gate(taught, model):  # what the training left open, and what to record
+    for finding in kinefit.markers.training_gate(taught, model):  # what the training left open, and what to record
         print(f"training: {finding}")
 
     found = kinefit.identify_take(model, take)
@@ -55,9 +55,9 @@ def main(labelled=None, points=None, out="kinefit-example"):
         print(f"{name}: {angle.min():.0f} to {angle.max():.0f} deg")
 
     Path(out).mkdir(parents=True, exist_ok=True)
-    kinefit.write_markers(named, Path(out) / "labelled.c3d")
-    kinefit.write_osim(subject.body, Path(out) / "body.osim")
-    kinefit.write_mot(motion, Path(out) / "motion.mot")
+    kinefit.exporters.write_markers(named, Path(out) / "labelled.c3d")
+    kinefit.exporters.write_osim(subject.body, Path(out) / "body.osim")
+    kinefit.exporters.write_mot(motion, Path(out) / "motion.mot")
     print(f"written: {out}/labelled.c3d, body.osim, motion.mot")
     return found, motion
 

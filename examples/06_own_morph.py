@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 import kinefit
-from kinefit import correspondences, rendering
+from kinefit.bodies import rendering
+from kinefit.solving import correspondences
 
 ARM = """
 [body]
@@ -55,7 +56,7 @@ def main(picture=None, seed=0):
             pose = body.pose(state)
             gap = np.sum(axes * (seen - pose.vertices[nodes]), axis=1)
             rows = correspondences.morphed_rows(pose, nodes, axes, gap, sigma=0.002)
-            state = kinefit.gauss_newton(arm, state, [rows, correspondences.prior_rows(arm, state)]).state
+            state = kinefit.solving.gauss_newton(arm, state, [rows, correspondences.prior_rows(arm, state)]).state
         errors[name] = np.degrees(np.abs(state.angles - truth.angles).max())
         print(f"{name:>9} model: angles off by at most {errors[name]:.2f} deg")
     if picture:

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 import kinefit
+from kinefit.observations import KeypointFrame
+from kinefit.sensors import Scene, Unknown
 
 POST, LENGTH, RATE = np.array([0.9, 1.7, 0.9]), 0.8, 30.0
 SETTINGS = kinefit.TrackSettings(angle_acceleration=60.0)
@@ -17,7 +19,7 @@ SHOULDER[1, 3] = 1.4
 
 
 class Rope(kinefit.Sensor):
-    name, unknowns = "rope", {"length": kinefit.Unknown(1.0, 0.3)}
+    name, unknowns = "rope", {"length": Unknown(1.0, 0.3)}
 
     def prepare(self, frame, scene):
         return frame
@@ -44,16 +46,13 @@ def simulated(arm, rig, frames, noise_px, random):
     points = arm.keypoints("MEDIAPIPE_33")
     for k in range(frames):
         mean = np.array([1.0, -0.5, 0.0, 0.8, 0.3, 0.0, 0.0]) + 0.6 * np.sin(2 * np.pi * k / frames + np.arange(7))
-        scene = kinefit.Scene(arm, kinefit.BodyState(SHOULDER, mean), rig, values={"rope": {"length": LENGTH}})
-
-        def rows(state, scene=scene, mean=mean):
-            prior = kinefit.solving.correspondences.prior_rows(arm, state, mean=mean, sigma=9)
-            return [Pull(0, False).rows(scene.at(state)), prior]
-
-        state = kinefit.levenberg_marquardt(arm, scene.state, rows).state
+        scene = Scene(arm, kinefit.BodyState(SHOULDER, mean), rig, values={"rope": {"length": LENGTH}})
+        prior = lambda state, mean=mean: kinefit.solving.correspondences.prior_rows(arm, state, mean=mean, sigma=9)
+        rows = lambda state, scene=scene: [Pull(0, False).rows(scene.at(state)), prior(state)]  # noqa: B023
+        state = kinefit.solving.levenberg_marquardt(arm, scene.state, rows).state
         taut = bool(Pull(0, True).rows(scene.at(state)).residual[0] > -1e-3)
         uv = [c.project(arm.positions(state, points)) + noise_px * random.normal(size=(len(points), 2)) for c in rig]
-        frame = lambda c, p: kinefit.KeypointFrame(c.name, k / RATE, points.names, p, np.ones(len(p)), "MEDIAPIPE_33")  # noqa: B023
+        frame = lambda c, p: KeypointFrame(c.name, k / RATE, points.names, p, np.ones(len(p)), "MEDIAPIPE_33")  # noqa: B023
         yield state, [*map(frame, rig, uv), Pull(k / RATE, taut)]
 
 
@@ -63,10 +62,10 @@ def main(frames=60, noise_px=1.0, seed=0):
     options = {"rate": RATE, "sigma": dict.fromkeys(rig.names, noise_px), "settings": SETTINGS, "up": "y"}
     near = [kinefit.BodyState(s.T_world_root, s.angles + 0.05 * random.normal(size=7)) for s in states[::3]]
     sensors = kinefit.Tracker(arm, rig, sensors=[Rope()], **options).sensors
-    seen = [sensors.measurements(f, kinefit.Scene(arm, s, rig)) for f, s in zip(steps[::3], near)]
-    subject = kinefit.fit_subject(arm, rig, seen, near, [kinefit.OwnUnknowns.of([Rope()])])
+    seen = [sensors.measurements(f, Scene(arm, s, rig)) for f, s in zip(steps[::3], near)]
+    subject = kinefit.fitting.fit_subject(arm, rig, seen, near, [kinefit.fitting.OwnUnknowns.of([Rope()])])
     print("the rope is {:.4f} ± {:.4f} m long;".format(*subject.value("rope length")), LENGTH, "m is the truth")
-    errors, hand = {}, lambda s: kinefit.Scene(arm, s, rig).position("r_dactylion")
+    errors, hand = {}, lambda s: Scene(arm, s, rig).position("r_dactylion")
     for name, used in (("one camera", slice(0, 1)), ("one camera and the rope", slice(0, 3, 2))):
         tracker = kinefit.Tracker(arm, rig, values=subject.values, sensors=[Rope()], **options)
         tracker.start_at(states[0])

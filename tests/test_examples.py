@@ -22,8 +22,8 @@ def test_each_example_has_a_test():
     assert all(f'example("{path.stem}")' in here for path in FOLDER.glob("*.py"))
 
 
-def test_examples_import_kinefit_alone():
-    allowed = re.compile(r"^(import kinefit$|from kinefit import )")
+def test_examples_import_from_doors_alone():
+    allowed = re.compile(r"^(import kinefit$|from kinefit(\.[a-z]+)? import )")
     lines = [line for path in FOLDER.glob("*.py") for line in path.read_text("utf-8").splitlines()]
     assert [line for line in lines if re.match("(from|import) kinefit", line) and not allowed.match(line)] == []
 

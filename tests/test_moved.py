@@ -6,6 +6,7 @@ from importlib.util import find_spec
 import pytest
 
 import kinefit
+from kinefit._doors import public_names
 from kinefit._moved import MOVED_PATHS, moved
 
 
@@ -36,3 +37,17 @@ def test_what_never_was_is_no_module():
     with pytest.raises(ModuleNotFoundError, match="nothing"), pytest.warns(DeprecationWarning):
         import_module("kinefit.tracking.nothing")
     assert not moved("kinefit.markers")  # the room of that name
+
+
+def test_names_of_old_lead_to_their_rooms_with_a_warning():
+    with pytest.warns(FutureWarning, match=r"kinefit\.exporters\.write_bvh now"):
+        assert kinefit.write_bvh is kinefit.exporters.write_bvh
+    with pytest.warns(FutureWarning, match=r"kinefit\.geometry\.huber now"):
+        assert kinefit.huber is kinefit.geometry.huber
+
+
+def test_every_name_of_a_door_is_there():
+    for name, package in public_names().items():
+        assert getattr(import_module(package), name) is not None
+    with pytest.raises(AttributeError, match="'kinefit.solving' has no attribute 'nothing'"):
+        kinefit.solving.nothing  # noqa: B018

@@ -27,8 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import figure
-from kinefit import DepthFrame, KeypointFrame, MarkerFrame, Measurement, Recording, RowsOf, Scene, Sensor, track
+from kinefit import Measurement, Recording, RowsOf, Sensor, track
 from kinefit.geometry.camera import Rig
+from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame
+from kinefit.sensors import Scene
 from kinefit.simulation import DepthSensor, in_front, simulate_depth, simulate_keypoints, squat_and_wave, studio_rig
 
 GOALS = {"keypoint": (9, 7), "depth": (8, 7), "marker": (7, 6), "own": (5, 4)}

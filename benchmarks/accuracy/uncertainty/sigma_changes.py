@@ -20,7 +20,8 @@ from benchmarks.accuracy.mixed.mixed_takes import marked, record, take_text
 from benchmarks.accuracy.uncertainty.sigma import FRAMES, JOINTS, SETUPS
 from benchmarks.accuracy.video.setups import around
 from benchmarks.figures import LEFT_OUT, amount, figure
-from kinefit import Motion, range_changes, track_take
+from kinefit import Motion, track_take
+from kinefit.exporters import range_changes
 from kinefit.exporters.c3d_file import write_markers
 
 FIRST, TWINS, CHANGES = 9100, 20, (5.0, 10.0, 20.0)  # [deg]

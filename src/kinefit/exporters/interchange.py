@@ -12,6 +12,7 @@ from uuid import NAMESPACE_URL, uuid5
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit._files import writing
 from kinefit.bodies.motion import Motion
 from kinefit.errors import ExportError, extra
@@ -21,6 +22,7 @@ CONFIDENCE_RADIUS_M = 0.02
 """[m] within which `confidence` has the true joint centre."""
 
 
+@checked
 def write_nwb(motion: Motion, path: str | PathLike[str], *, up: str | None = None, names: str = "kinefit") -> None:
     """Write joint centres as NWB: a PoseEstimation of ndx-pose in the processing module "behavior".
 
@@ -165,6 +167,7 @@ _MOVE = (
 )
 
 
+@checked
 def write_mcap(motion: Motion, path: str | PathLike[str], *, up: str = "z", names: str = "kinefit") -> None:
     """Write a motion as MCAP with messages of ROS 2, in metres and radians.
 
@@ -218,6 +221,7 @@ def write_mcap(motion: Motion, path: str | PathLike[str], *, up: str = "z", name
                 out.write_message(topic, state, message, **log)
 
 
+@checked
 def write_rrd(motion: Motion, path: str | PathLike[str], *, up: str | None = None, names: str = "kinefit") -> None:
     """Write a motion as a recording of Rerun, in metres and degrees, over the timelines `time` and `frame`.
 

@@ -131,6 +131,7 @@ def pose(
     }  # fmt: skip
 
 
+@checked
 def write_jsonl(motion: Motion, path: str | PathLike[str], *, up: str | None = None) -> None:
     """Write a motion as JSON lines: `hello`, then a `pose` for each frame.
 

@@ -180,6 +180,7 @@ def write_csv(
     return _write(_in_pieces(motion, unit, up, names), Path(folder), ".csv", to_csv)
 
 
+@checked
 def write_parquet(
     motion: Motion, folder: str | PathLike[str], *, unit: str = "m", up: str | None = None, names: str | None = None
 ) -> tuple[Path, ...]:
@@ -219,6 +220,7 @@ def parquet_writer(folder: str | PathLike[str], about: dict[str, str]) -> Callab
     return to_parquet
 
 
+@checked
 def tables(
     motion: Motion, *, unit: str = "m", up: str | None = None, names: str | None = None
 ) -> dict[str, Table]:

@@ -1,1 +1,5 @@
 """Files to observations."""
+
+from kinefit._doors import door_of
+
+__getattr__, __dir__ = door_of(__name__)

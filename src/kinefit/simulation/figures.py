@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies import Body, MeshSurface
 from kinefit.bodies.motion import UP_AXES, Motion
 from kinefit.bodies.rendering.looks import side_colour
@@ -33,6 +34,7 @@ _MAX_DISTANCE = 20.0  # [m]
 _SURFACE_MARGIN = 0.1  # [m] between landmarks and the body's surface
 
 
+@checked
 def in_front(
     motion: Motion, camera: Camera, *, distance: float | None = None, azimuth: float = 0.0, height: float = 1.2,
     near: float = 0.0, far: float = np.inf,
@@ -118,6 +120,7 @@ _END_CORNERS = 32  # of the polygon of a round end
 _SUBPIXEL_BITS = 4  # of corners in drawing functions
 
 
+@checked
 def draw_figure(motion: Motion, frame: int, camera: Camera, image: NDArray | None = None) -> NDArray:
     """Image (H, W, 3) of the body's surfaces, BGR 8 bit, drawn from far to near.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies.motion import Motion, rotation_between_up
 from kinefit.errors import ObservationError
 from kinefit.geometry import se3
@@ -85,6 +86,7 @@ def studio_rig(
     return Rig(tuple(placed))
 
 
+@checked
 def simulate_keypoints(
     motion: Motion,
     rig: Rig,

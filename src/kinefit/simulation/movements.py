@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies import Body, TaperedCylinder, load_body
 from kinefit.bodies.motion import Motion
 from kinefit.errors import ObservationError, choices
@@ -197,6 +198,7 @@ class Performer:
     azimuth: float
 
 
+@checked
 def movement(name: str, body: Body | None = None, *, rate: float = 30.0, speed: float = 1.0) -> Motion:
     """One of the ten movements: point, walk, wave, shake_hands, bow, clap, sit_down, kick, squat, arms_at_sensor.
 

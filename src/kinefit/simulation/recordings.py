@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies.motion import UP_AXES, Motion
 from kinefit.errors import ExportError, ObservationError, choices
 from kinefit.fitting.tracking.recording import Recording
@@ -62,6 +63,7 @@ class _Job:
         self.step(name, count, count)
 
 
+@checked
 def write_recording(
     motion: Motion,
     folder: str | os.PathLike[str],
@@ -286,6 +288,7 @@ _IMAGE_SIZE = (544, 960)  # [px]
 _FOUR_CAMERAS = "A simulated figure in four cameras. No recording of a person."
 
 
+@checked
 def write_synthetic_take(folder: str | os.PathLike[str], motion: Motion | None = None, *, seed: int = 0) -> Path:
     """Write a take of a drawn figure: four videos with keypoints, calibration and take.toml.
 

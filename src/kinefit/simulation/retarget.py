@@ -97,6 +97,7 @@ def retarget(
     return replace(motion, provenance={FINDINGS: as_records([bones.doubt])}) if bones.doubt else motion
 
 
+@checked
 def known_motion(
     body: Body, rate: float, Ts_world_root: NDArray, angles: NDArray, *, up: str = "y", name: str = "motion"
 ) -> Motion:
@@ -244,6 +245,7 @@ def _turn_from_median(directions: NDArray, R: NDArray) -> NDArray:
     return se3.shortest_turn(np.median(local, axis=0), local)
 
 
+@checked
 def cut(motion: Motion, start: int, stop: int | None = None) -> Motion:
     """Cut frames [start, stop) out of a motion, like a Python slice; its time starts at zero.
 
@@ -269,6 +271,7 @@ def cut(motion: Motion, start: int, stop: int | None = None) -> Motion:
     return replace(motion, times=times - times[:1], residuals=residuals, **arrays)
 
 
+@checked
 def resampled(motion: Motion, rate: float) -> Motion:
     """Resample a motion at another rate [Hz]: angles and root position linearly, root rotation along the shortest arc.
 
@@ -299,6 +302,7 @@ _LANDMARK_STD = 0.01  # [m]; small relative to a limb, so that priors determine 
 _MIN_LANDMARKS = 6  # in common: fewer do not determine all limbs
 
 
+@checked
 def on_body(motion: Motion, body: Body) -> Motion:
     """Fit another body to the landmarks of a motion that both bodies have by name.
 

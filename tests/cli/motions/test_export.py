@@ -86,7 +86,7 @@ def test_tables_are_a_folder(file):
 def test_unit_and_vertical_axis_are_those_asked_for(file, motion, tmp_path):
     told = run("export", file, "--to", "bvh", "--unit", "mm", "--up", "z", "--out", tmp_path / "there" / "x.bvh")
     assert told.exit_code == 0, told.output
-    read = kinefit.read_bvh(tmp_path / "there" / "x.bvh", unit=0.001, up="z")
+    read = kinefit.readers.read_bvh(tmp_path / "there" / "x.bvh", unit=0.001, up="z")
     root = read.Ts_world_joint[:, 0, :3, 3]
     assert np.allclose(root, motion.Ts_world_root[:, :3, 3], atol=1e-6)  # the motion is z up, in metres
 

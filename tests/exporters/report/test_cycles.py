@@ -123,7 +123,7 @@ def test_likeness_is_one_for_equal_curves_and_falls_with_noise(count, size, offs
 
 @pytest.mark.slow
 def test_a_recorded_walk(data_dir):
-    from kinefit import read_bvh
+    from kinefit.readers import read_bvh
     from kinefit.simulation import cut, resampled, retarget
 
     motion = retarget(read_bvh(data_dir("motion_cmu_bvh") / "cmu_12_01_walk.bvh"))

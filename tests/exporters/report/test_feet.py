@@ -17,7 +17,7 @@ from kinefit.simulation import known_motion
 @pytest.fixture(scope="module")
 def recorded(data_dir):
     """(259 frames at 60 Hz) of a person who walks over a floor."""
-    from kinefit import read_bvh
+    from kinefit.readers import read_bvh
     from kinefit.simulation import cut, resampled, retarget
 
     return resampled(cut(retarget(read_bvh(data_dir("motion_cmu_bvh") / "cmu_12_01_walk.bvh")), 6), 60.0)

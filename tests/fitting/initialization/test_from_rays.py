@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import kinefit
+from kinefit.observations import KeypointFrame
 from kinefit.simulation import in_front, movement
 
 POST = np.array([0.3, 2.0, -0.4])
@@ -55,7 +56,7 @@ def seen(turn, frames=4):
         state = kinefit.BodyState(T, truth.state(k).angles)
         uv = camera.project(BODY.positions(state, points)) + rng.normal(size=(len(points), 2))
         away = np.linalg.norm(POST - BODY.positions(state, wrists), axis=1) + 0.01 * rng.normal(size=2)
-        pixels = kinefit.KeypointFrame("cam", k / 30.0, points.names, uv, np.ones(len(points)), "MEDIAPIPE_33")
+        pixels = KeypointFrame("cam", k / 30.0, points.names, uv, np.ones(len(points)), "MEDIAPIPE_33")
         states.append(state)
         steps.append([pixels, Ranges(k / 30.0, away)])
     return states, steps, kinefit.Rig((camera,)), root

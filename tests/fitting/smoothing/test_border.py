@@ -7,8 +7,10 @@ import pytest
 from tests.fitting.subject import measured
 from tests.fitting.subject.measured import ARM, RIG, Pulling, Rope
 
-from kinefit import KeypointFrame, Recording, TrackSettings, Unknown, track
+from kinefit import Recording, TrackSettings, track
 from kinefit.fitting.smoothing.border import Border
+from kinefit.observations import KeypointFrame
+from kinefit.sensors import Unknown
 
 RATE, LENGTH, POST = 30.0, 0.8, np.array([0.9, 0.3, 0.9])
 HAND = ARM.landmarks.select(("r_dactylion",))

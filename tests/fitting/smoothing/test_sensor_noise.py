@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinefit import MarkerFrame, Recording
+from kinefit import Recording
 from kinefit.bodies.surfaces import segment_middles
 from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.fitting.frame.fit import rows_of
@@ -17,6 +17,7 @@ from kinefit.fitting.smoothing.smoother import as_tracked
 from kinefit.fitting.smoothing.tracked_frames import squares_of
 from kinefit.fitting.tracking.run import run
 from kinefit.geometry.camera import Rig
+from kinefit.observations import MarkerFrame
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import squat_and_wave

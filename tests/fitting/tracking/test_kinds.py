@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from kinefit import FixedLag, Recording, Tracker, load_body, track
+from kinefit import Recording, Tracker, load_body, track
 from kinefit.errors import KinefitError, ObservationError
+from kinefit.fitting import FixedLag
 from kinefit.observations import (
     DepthFrame,
     KeypointFrame,

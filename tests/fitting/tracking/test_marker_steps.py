@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinefit import BodyState, MarkerFrame, Recording
+from kinefit import BodyState, Recording
 from kinefit.fitting.tracking.run import fit_marker_steps, run
 from kinefit.fitting.tracking.video import track
 from kinefit.geometry.camera import Rig
+from kinefit.observations import MarkerFrame
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import squat_and_wave
 

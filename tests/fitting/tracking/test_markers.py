@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinefit import BodyState, MarkerFrame, Markers, Recording, fit_marker_subject, fit_markers, load_body, track
+from kinefit import BodyState, Markers, Recording, fit_marker_subject, fit_markers, load_body, track
 from kinefit.bodies.marker_sets import bare, placement
 from kinefit.errors import ObservationError
 from kinefit.fitting.smoothing.smoother import smooth_results
 from kinefit.fitting.tracking.run import fit_marker_steps
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.losses import SQUARED
-from kinefit.observations import NamedMarkers
+from kinefit.observations import MarkerFrame, NamedMarkers
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import squat_and_wave
 from kinefit.simulation.evaluation import joint_errors

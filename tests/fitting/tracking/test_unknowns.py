@@ -8,14 +8,14 @@ from tests.fitting.subject import measured
 from tests.fitting.subject.measured import ARM, Pulling, Rope
 from tests.oracle import rig_around
 
-from kinefit import Keypoints, MarkerFrame, Markers, load_body, track
+from kinefit import Keypoints, Markers, load_body, track
 from kinefit.fitting.subject.parameters import KnownLengths, PointOffsets, SegmentScales, World
 from kinefit.fitting.subject.subject import CameraExtrinsics, Subject
 from kinefit.fitting.subject.surfaces import CylinderShape
 from kinefit.fitting.tracking.recording import Recording
 from kinefit.fitting.tracking.unknowns import of_all, of_points
 from kinefit.geometry.camera import Rig
-from kinefit.observations import NamedMarkers
+from kinefit.observations import MarkerFrame, NamedMarkers
 from kinefit.sensors.settings import CameraErrors
 from kinefit.simulation import squat_and_wave
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from benchmarks.scenes.bags import START, Bag
 
-from kinefit import read_depth
 from kinefit.errors import CalibrationError, FileError, ObservationError
+from kinefit.readers import read_depth
 
 pytest.importorskip("rosbags.rosbag2")
 pytest.importorskip("mcap_ros2")

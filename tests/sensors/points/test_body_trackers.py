@@ -7,10 +7,11 @@ import pytest
 from tests.fitting.tracking.movements import BODY, RATE, STILL, a_motion
 from tests.oracle import STATES, central_differences, state_of
 
-from kinefit import BodyTrackerFrame, Recording, Tracker, load_body, track
+from kinefit import Recording, Tracker, load_body, track
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
+from kinefit.observations import BodyTrackerFrame
 from kinefit.sensors.points.body_trackers import BodyTrackerSensor
 from kinefit.sensors.scene import Scene
 

@@ -9,6 +9,7 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.marker_sets import sets as marker_sets
 from kinefit.errors import FileError, ObservationError
@@ -41,6 +42,7 @@ def placed_set_names() -> tuple[str, ...]:
     return marker_sets.marker_set_names(placed=True)
 
 
+@checked
 def placement(body: Body, marker_set: str | PathLike[str] | MarkerPlacement) -> MarkerPlacement:
     """Place a marker set on a body: a set of the body or of the catalogue, a file (.toml), or a placement as given.
 

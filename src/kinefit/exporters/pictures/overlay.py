@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit._files import write_image, writing
 from kinefit._threads import ahead
 from kinefit.bodies.motion import Motion, Residuals
@@ -32,6 +33,7 @@ _TICK = Fraction(1, 60000)  # [s] of times in a video: MPEG-4 has 16 bits for it
 _CODECS = {"libx264": {"preset": "superfast", "crf": "21"}, "mpeg4": {"qscale": "3"}}
 
 
+@checked
 def write_overlay(
     motion: Motion,
     camera: Camera,
@@ -117,6 +119,7 @@ def frames_of(motion: Motion, times: NDArray) -> range:
     return range(inside[0], inside[-1] + 1) if len(inside) else range(len(times))
 
 
+@checked
 def draw_overlay(
     image: NDArray[np.uint8],
     motion: Motion,
@@ -161,6 +164,7 @@ def draw_overlay(
     return out
 
 
+@checked
 def write_montage(
     images: Mapping[str, NDArray[np.uint8]], path: str | PathLike[str], *, height: int = 960, gap: int = 8
 ) -> None:
@@ -248,6 +252,7 @@ _DASH_PX = 6.0  # of a lost segment's outline
 _WIDTH = 640  # [px] of a picture, at least: small sensors are enlarged
 
 
+@checked
 def depth_picture(
     depth: NDArray, motion: Motion, frame: int | None, camera: Camera, *, label: str = ""
 ) -> NDArray[np.uint8]:
@@ -289,6 +294,7 @@ def depth_picture(
     return out
 
 
+@checked
 def write_depth_overlay(
     motion: Motion, camera: Camera, depth: DepthVideo, path: str | PathLike[str], *,
     progress: Callable[[int], None] | None = None,

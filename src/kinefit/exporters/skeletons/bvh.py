@@ -112,6 +112,7 @@ _HEAD = """<?xml version="1.0" encoding="UTF-8"?>
 xsd:noNamespaceSchemaLocation="https://www.web3d.org/specifications/x3d-4.0.xsd">"""
 
 
+@checked
 def write_x3d(motion: Motion, path: str | PathLike[str], *, names: str | None = None, rest: str | None = None) -> None:
     """Write a motion as X3D 4.0: an HAnimHumanoid of HAnimJoints, turned by interpolators.
 

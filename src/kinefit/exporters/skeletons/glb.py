@@ -154,6 +154,7 @@ ENDINGS = (".usd", ".usda", ".usdc")
 _UPS = ("y", "z")
 
 
+@checked
 def write_usd(
     motion: Motion, path: str | PathLike[str], *, unit: str = "m", up: str = "y", names: str = "kinefit",
     rest: str | None = None, cylinders: bool = False,

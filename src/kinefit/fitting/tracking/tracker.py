@@ -31,8 +31,6 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.solving.mobility import check_closed
 from kinefit.solving.rows import AnyRows
 
-__all__ = ["FrameResult", "TrackSettings", "Tracker"]
-
 
 class Tracker:
     """Follows one body from frame to frame in whatever its sensors see.

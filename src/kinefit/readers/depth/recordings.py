@@ -242,7 +242,7 @@ def _nothing(what: str) -> FileError:
 def _organised(files: list[Path], name: str) -> images.DepthSource:
     first = clouds.read_cloud(files[0])
     if first.shape is None:
-        remedy = "Read it with kinefit.read_clouds; a take does so by itself."
+        remedy = "Read it with kinefit.readers.read_clouds; a take does so by itself."
         raise ObservationError("a cloud without the rows of an image", file=files[0], remedy=remedy)
     return images.DepthSource(
         len(files), lambda i: _depth(files[i]), first.shape[::-1], 1.0,

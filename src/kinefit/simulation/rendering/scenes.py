@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies import Body
 from kinefit.bodies.motion import UP_AXES, Motion
 from kinefit.bodies.rendering import Canvas, Raster, scaled, subdivided
@@ -299,6 +300,7 @@ COLOUR = ColourSensor("colour", (640, 480), 575.0)
 STEREO = StereoSensor("stereo", (320, 240), 290.0)
 
 
+@checked
 def picture(
     scene: SimulatedScene,
     frame: int,

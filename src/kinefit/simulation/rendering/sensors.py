@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.rendering import scaled
 from kinefit.errors import ObservationError
@@ -105,6 +106,7 @@ KINECT = DepthSensor(
 DEPTH_SENSORS = {sensor.name: sensor for sensor in (TOF, KINECT)}
 
 
+@checked
 def simulate_depth(
     motion: Motion,
     camera: Camera,
