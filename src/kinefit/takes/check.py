@@ -13,9 +13,9 @@ from kinefit.exporters.report.feet import foot_findings
 from kinefit.findings import Finding
 from kinefit.fitting.markers.subject import fit_marker_subject
 from kinefit.fitting.subject.subject import Subject
-from kinefit.fitting.tracking.markers import fit_markers
 from kinefit.fitting.tracking.sizing import SizedPerson, sized_by_depth
 from kinefit.fitting.tracking.take_recording import label_findings_of, recording_of, sensors_of
+from kinefit.fitting.tracking.video import fit_markers
 from kinefit.readers.take.cameras import is_alone
 from kinefit.readers.take.file import Take, read_take
 from kinefit.rigs.diagnostics.checks import CHECKS, Check, Checked, Progress, run
