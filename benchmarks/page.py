@@ -4,14 +4,16 @@ The values of the pages on the papers are written, too.
 
 A subject of the page takes the figures whose command begins with one of its `runs`. Figures whose names begin alike
 share a row of its table, in which each has a line of its own; a run that all of them have in common stands once.
+A figure that is retired keeps its record in the log and has no line but that of the reason, at the end of the page.
 """
 
 from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from datetime import date, timedelta
+from fnmatch import fnmatchcase
 from itertools import groupby
 from textwrap import shorten
 from typing import Any
@@ -39,10 +41,12 @@ def page(records: Mapping[str, Record], words: Mapping[str, Any]) -> str:
     Raises
     ------
     ValueError
-        Where a command of the log belongs to no subject, a meaning to no figure, or a sentence names what was not
-        measured.
+        Where a command of the log belongs to no subject, a meaning or a retired name to no figure, or a sentence
+        names what was not measured.
     """
     newest = max(date.fromisoformat(record.date) for record in records.values())
+    old = [(_retired(one, records), one["reason"]) for one in words["retired"]]
+    records = {name: one for name, one in records.items() if not any(name in gone for gone, _ in old)}
     names = figures_of_subjects(records, words["subject"])
     parts = [words["head"].strip(), _table(("what", "figure", "goals"), _glance(records, words["glance"]))]
     for subject in words["subject"]:
@@ -51,9 +55,46 @@ def page(records: Mapping[str, Record], words: Mapping[str, Any]) -> str:
         parts.append(_table(("what", "value", "goal", "verdict", "run"), rows))
         means = [f"`{name}`: {meaning}" for name, meaning in subject.get("means", {}).items()]
         parts += ["<br>".join(means)] * bool(means)
-    retired = [(one["figures"], one["reason"]) for one in words.get("retired", [])]
-    parts += ["## Retired", _table(("figures", "why no benchmark prints them any more"), retired)]
+    head = "figures", "what they were last", "why no benchmark prints them any more"
+    rows = [
+        (_names(one), _last(gone.values()), why) for one, (gone, why) in zip(words["retired"], old, strict=True)
+    ]
+    parts += ["## Retired", _table(head, rows)]
     return "\n\n".join(parts) + "\n"
+
+
+def living(records: Mapping[str, Record], words: Mapping[str, Any]) -> dict[str, Record]:
+    """The records without those of retired figures."""
+    gone = {name for one in words["retired"] for name in _retired(one, records)}
+    return {name: record for name, record in records.items() if name not in gone}
+
+
+def _retired(entry: Mapping[str, Any], records: Mapping[str, Record]) -> dict[str, Record]:
+    """The records of an entry: those whose names fit its patterns, and all that its parts printed."""
+    found: dict[str, Record] = {}
+    for part in entry.get("parts", []):
+        found |= {n: one for n, one in records.items() if one.command == f"python -m benchmarks {part}"}
+    for pattern in entry.get("names", []):
+        fitting = {n: one for n, one in records.items() if fnmatchcase(n, pattern)}
+        if not fitting:
+            raise ValueError(f"docs/figures.toml, retired: no such figure: {pattern}")
+        found |= fitting
+    return found
+
+
+def _names(entry: Mapping[str, Any]) -> str:
+    parts = [f"all of `{part}`" for part in entry.get("parts", [])]
+    return ", ".join([*parts, *(f"`{name}`" for name in entry.get("names", []))])
+
+
+def _last(records: Collection[Record]) -> str:
+    """How retired figures stood when they were printed last: "2 of 3 met, 2026-11-21"."""
+    if not records:
+        return "never logged"
+    met = sum(one.verdict == "met" for one in records)
+    missed = ", ".join(f"`{one.name}` {_value(one)}" for one in records if one.verdict == "missed")
+    told = f"; **missed**: {missed}" if missed else ""
+    return f"{met} of {len(records)} met, {max(one.date for one in records)}{told}"
 
 
 def figures_of_subjects(records: Mapping[str, Record], subjects: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
@@ -163,7 +204,12 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def written() -> str:
     """The page as log and words have it now."""
-    return page(read(LOG), tomllib.loads(WORDS.read_text("utf-8")))
+    return page(read(LOG), worded())
+
+
+def worded() -> dict[str, Any]:
+    """What docs/figures.toml says."""
+    return tomllib.loads(WORDS.read_text("utf-8"))
 
 
 if __name__ == "__main__":

@@ -8,8 +8,8 @@ import av
 import cv2
 import numpy as np
 import pytest
-from benchmarks.robustness.faults_readers import _jpeg, _png
 from benchmarks.scenes.bags import Bag
+from benchmarks.scenes.large_images import jpeg, png
 
 from kinefit._image_headers import MAX_IMAGE_PIXELS, image_sizes
 from kinefit._pictures import read_picture
@@ -87,7 +87,7 @@ def _tiff(side):
     return bytes(data)
 
 
-BOMBS = [("0.png", _png), ("0.jpg", _jpeg), ("0.tif", _tiff)]
+BOMBS = [("0.png", png), ("0.jpg", jpeg), ("0.tif", _tiff)]
 
 
 @pytest.mark.parametrize(("name", "make"), BOMBS)
@@ -129,10 +129,10 @@ def test_compressed_images_of_a_recording_count_too(tmp_path, no_decoder):
     bag = Bag()
     for k in range(2):
         message = bag.image("jpeg", np.zeros((16, 16, 3), np.uint8), 10**9 + k * 10**8)
-        message.data = np.frombuffer(_jpeg(SIDE), np.uint8)
+        message.data = np.frombuffer(jpeg(SIDE), np.uint8)
         bag.messages.append(("/a/image", message, 10**9 + k * 10**8))
         counts = bag.image("16UC1 png", np.zeros((16, 16), np.uint16), 10**9 + k * 10**8)
-        counts.data = np.concatenate([np.zeros(12, np.uint8), np.frombuffer(_png(SIDE, 16), np.uint8)])
+        counts.data = np.concatenate([np.zeros(12, np.uint8), np.frombuffer(png(SIDE, 16), np.uint8)])
         bag.messages.append(("/b/depth", counts, 10**9 + k * 10**8))
     file = bag.write(tmp_path / "bag")
     for read in (lambda: Video(file / "a/image"), lambda: read_depth(file / "b/depth")):

@@ -10,7 +10,7 @@ from types import MappingProxyType
 import msgspec
 import numpy as np
 import pytest
-from benchmarks.robustness.faults_folder import unpickling_modules
+from benchmarks.house.house_imports import unpickling_modules
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays

@@ -77,3 +77,22 @@ def circles(types: bool) -> list[list[str]]:
     _, labels = connected_components(graph, connection="strong")
     groups = [[modules[k] for k in np.flatnonzero(labels == label)] for label in np.unique(labels)]
     return [group for group in groups if len(group) > 1]
+
+
+_UNPICKLING = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"}
+MACHINE_CODE = {"_jit.py"}
+"""numba pickles compiled kernels: machine code, which runs in any format. So the folder is the user's alone."""
+
+
+def unpickling_modules() -> list[str]:
+    """Modules of kinefit that could unpickle: they import what does, or let numpy do it; but for `MACHINE_CODE`."""
+    found = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        names = set()
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                names |= {alias.name for alias in node.names} | {getattr(node, "module", None) or ""}
+            names |= {"pickle"} if isinstance(node, ast.keyword) and node.arg == "allow_pickle" else set()
+        if {name.partition(".")[0] for name in names} & _UNPICKLING:
+            found.append(path.relative_to(PACKAGE).as_posix())
+    return [name for name in found if name not in MACHINE_CODE]

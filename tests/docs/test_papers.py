@@ -4,6 +4,7 @@ import re
 
 import pytest
 from benchmarks.ledger import LOG, read
+from benchmarks.page import living, worded
 from benchmarks.papers.papers_rows import INDEX, ROWS, filled_index, filled_page, pages, read_rows
 
 PARTS = ("In the paper", "Here", "What differs", "Figure")
@@ -19,6 +20,11 @@ def test_every_row_has_its_heading_and_all_parts():
     assert not [row.item for row in rows if not row.source or not (row.parts or row.tests)]
     root = INDEX.parents[1]
     assert not [test for row in rows for test in row.tests if not (root / test).exists()]
+
+
+def test_no_row_shows_a_figure_that_is_retired():
+    shown = {name for row in read_rows(TEXTS) for name in row.figures}
+    assert shown - living(read(LOG), worded()).keys() == set()
 
 
 def test_pages_and_index_show_what_the_log_says():
