@@ -201,7 +201,7 @@ def test_markers_and_calibrations_of_a_plugin(here, tmp_path):
 
 
 END = "\nTABLES = FileFormat("
-IMPORT = "from kinefit import FileFormat, Keypoints, MotionFormat"
+IMPORT = "from kinefit.readers import FileFormat"
 
 
 @pytest.mark.parametrize(

@@ -277,7 +277,7 @@ PREPARED = [
                     "        rest = np.zeros((2, 3)), np.eye(3)[:2], np.zeros(2), np.ones(2)\n"
                     "        return Rows.of(points.segments + 99, *rest)",
                 ),
-                ("import Measurement, Proposal,", "import Measurement, Proposal, Rows,"),
+                ("import Measurement, RowsOf,", "import Measurement, Rows, RowsOf,"),
             ],
             ("failed: sensor 'insole' has rows on segment 1[01].; body 'humanoid' has",),
         ),

@@ -88,7 +88,7 @@ def test_a_number_too_many_is_told(take, tmp_path):
 
 def test_of_one_who_cannot_be_tracked_the_others_still_are(take, tmp_path, monkeypatch):
     from kinefit.errors import TrackingError
-    from kinefit.takes import track as module
+    from kinefit.takes.batch import one as module
 
     original = module.track_take
 

@@ -53,7 +53,7 @@ def test_the_command_goes_on_after_ctrl_c(take, tmp_path, monkeypatch):
 def test_restart_begins_anew(take, tmp_path, monkeypatch):
     words = ["track", str(take), "--no-overlays", "--no-report", "--formats", "motion", "--out", str(tmp_path / "out")]
     with monkeypatch.context() as patched:
-        patched.setattr(one, "write_results", lambda *given: 1 / 0)
+        patched.setattr(one.results, "write_results", lambda *given: 1 / 0)
         assert CliRunner().invoke(main, words).exit_code != 0
     counted = []
     update = Tracker.update

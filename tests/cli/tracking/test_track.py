@@ -302,7 +302,7 @@ def test_a_folder_in_whose_place_a_file_stands_is_told_at_once(take, tmp_path):
 def test_a_full_disk_leaves_only_whole_files(take, tmp_path):
     code = (
         "import resource, sys; from kinefit.cli import main\n"
-        "import kinefit.takes.batch.one as r; write = r.write_overlays\n"
+        "import kinefit.takes.batch.results as r; write = r.write_overlays\n"
         "def limited(*a, **k):\n    resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000)); write(*a, **k)\n"
         "r.write_overlays = limited; main()"
     )

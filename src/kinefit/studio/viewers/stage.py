@@ -197,8 +197,11 @@ def open_server(port: int, access: Access | None = None, *, label: str = "kinefi
         viser is not installed, no port is free, the host's name is not one of this computer, or this version of viser
         cannot be kept from foreign pages.
     """
-    import viser
-
+    try:
+        import viser
+    except ImportError as error:
+        remedy = "Install it: pip install viser."
+        raise ExportError("the 3D viewer needs the package viser", remedy=remedy) from error
     from kinefit.studio.serving.server import listen
 
     access = access or Access()
