@@ -158,11 +158,11 @@ def motion_of(
     provenance["estimate"] = "smoothed" if smooth else alone if lag is None else "fixed lag"
     return Motion(
         body=body, rate=rate, times=frames.times, **_arrays(last, body, len(results)), residuals=residuals, up=up,
-        name=name, provenance=provenance, lasting=lasting, plates=(),
+        name=name, provenance=provenance, lasting=lasting,
     )  # fmt: skip
 
 
-def _arrays(results: Iterable[FrameResult], body: Body, frames: int) -> dict[str, NDArray]:
+def _arrays(results: Iterable[FrameResult], body: Body, frames: int) -> dict[str, Any]:
     """Arrays of a motion of so many frames."""
     segments, D = len(body.tree.segments), len(body.tree.coordinates)
     shapes = {
