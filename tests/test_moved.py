@@ -40,10 +40,9 @@ def test_what_never_was_is_no_module():
 
 
 def test_names_of_old_lead_to_their_rooms_with_a_warning():
-    with pytest.warns(FutureWarning, match=r"kinefit\.exporters\.write_bvh now"):
-        assert kinefit.write_bvh is kinefit.exporters.write_bvh
-    with pytest.warns(FutureWarning, match=r"kinefit\.geometry\.huber now"):
-        assert kinefit.huber is kinefit.geometry.huber
+    for room, name in (("exporters", "write_bvh"), ("geometry", "huber")):
+        with pytest.warns(FutureWarning, match=rf"kinefit\.{room}\.{name} now"):
+            assert getattr(kinefit, name) is getattr(getattr(kinefit, room), name)
 
 
 def test_every_name_of_a_door_is_there():
@@ -51,3 +50,9 @@ def test_every_name_of_a_door_is_there():
         assert getattr(import_module(package), name) is not None
     with pytest.raises(AttributeError, match="'kinefit.solving' has no attribute 'nothing'"):
         kinefit.solving.nothing  # noqa: B018
+
+
+def test_a_name_that_is_none_loads_no_room(monkeypatch):
+    public_names.cache_clear()
+    monkeypatch.setattr("kinefit._doors.import_module", lambda name: pytest.fail(f"{name} is loaded"))
+    assert not hasattr(kinefit, "nothing")

@@ -15,7 +15,7 @@ import warnings  # noqa: E402
 from importlib import import_module  # noqa: E402
 from typing import Any  # noqa: E402
 
-from kinefit._doors import names_of, public_names  # noqa: E402
+from kinefit._doors import ROOMS, door_of, names_of, public_names  # noqa: E402
 from kinefit._moved import MovedFinder, moved  # noqa: E402
 
 sys.meta_path.insert(0, MovedFinder())
@@ -25,12 +25,11 @@ __version__ = "0.2.0"
 
 def __getattr__(name: str) -> Any:
     if name == "__all__":
-        return [*names_of(__name__), "__version__"]
-    module, attribute = names_of(__name__).get(name, ("", ""))
-    if module == __name__:
-        return import_module(f"{module}.{attribute}")
-    if module:
-        return getattr(import_module(module), attribute)
+        return __dir__()
+    if name in ROOMS:
+        return import_module(f"kinefit.{name}")
+    if name in names_of(__name__):
+        return door_of(__name__)[0](name)
     if new := moved(f"kinefit.{name}"):
         return import_module(new)
     if room := public_names().get(name):

@@ -1,4 +1,4 @@
-"""Public names of a package: listed by the stub beside its `__init__.py`, loaded when they are first used."""
+"""Public names of packages, and the loading of those that a stub lists when they are first used."""
 
 from __future__ import annotations
 
@@ -17,12 +17,15 @@ ROOMS = (
 
 
 @cache
-def names_of(package: str) -> dict[str, tuple[str, str]]:
-    """{public name: (module, name in it)}, as the stub of a package imports them; empty without a stub."""
-    stub = Path(__file__).parent.joinpath(*package.split(".")[1:], "__init__.pyi")
-    lines = ast.parse(stub.read_text("utf-8")).body if stub.exists() else []
-    found = [line for line in lines if isinstance(line, ast.ImportFrom)]
-    return {name.asname or name.name: (line.module or "", name.name) for line in found for name in line.names}
+def names_of(package: str) -> dict[str, str]:
+    """{public name: module that has it}, as the stub of a package, or else its `__all__`, says; imports nothing."""
+    folder = Path(__file__).parent.joinpath(*package.split(".")[1:])
+    path = next(filter(Path.exists, (folder / "__init__.pyi", folder / "__init__.py")))
+    lines = ast.parse(path.read_text("utf-8")).body
+    if path.suffix == ".pyi":
+        return {one.name: line.module or "" for line in lines if isinstance(line, ast.ImportFrom) for one in line.names}
+    lists = [line for line in lines if isinstance(line, ast.Assign) and "__all__" in ast.unparse(line)]
+    return {name: package for line in lists for name in ast.literal_eval(line.value)}
 
 
 def door_of(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
@@ -33,8 +36,7 @@ def door_of(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]
             return [*names_of(package)]
         if name not in names_of(package):
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        module, attribute = names_of(package)[name]
-        return getattr(import_module(module), attribute)
+        return getattr(import_module(names_of(package)[name]), name)
 
     return get, lambda: sorted(names_of(package))
 
@@ -42,9 +44,5 @@ def door_of(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]
 @cache
 def public_names() -> dict[str, str]:
     """{public name: package that has it}: the door's own, then those of rooms, from below."""
-    found = dict.fromkeys(names_of("kinefit"), "kinefit")
-    for room in ROOMS:
-        package = import_module(f"kinefit.{room}")
-        names = vars(package).get("__all__", names_of(package.__name__))
-        found = dict.fromkeys(names, package.__name__) | found
-    return found
+    rooms = [f"kinefit.{room}" for room in reversed(ROOMS)]
+    return {name: package for package in [*rooms, "kinefit"] for name in names_of(package)}

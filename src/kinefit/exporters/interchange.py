@@ -142,8 +142,8 @@ def _plates(pynwb: Any, motion: Motion) -> Iterator[Any]:
             ("moment", "newton meters", plate.moment, "on the person, about the middle of the corners"),
             ("centre_of_pressure", "meters", plate.centre_of_pressure(), "NaN below 20 N"),
         ):
-            series = {"data": np.array(values), "unit": unit, "description": f"{text}; {about}"}
-            yield pynwb.TimeSeries(name=f"{name}_{what}", **series, **times)
+            said = f"{text}; {about}"
+            yield pynwb.TimeSeries(f"{name}_{what}", np.array(values), unit, description=said, **times)
 
 
 WORLD = "world"
