@@ -29,7 +29,7 @@ from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry import se3
 from kinefit.takes.preparing import detecting
 
-_TRIALS = "STS", "walk_ts"
+TRIALS = "STS", "walk_ts"
 _JOINTS = {
     "pelvis": "", "femur_r": "thigh_r", "tibia_r": "shank_r", "talus_r": "foot_r", "femur_l": "thigh_l",
     "tibia_l": "shank_l", "talus_l": "foot_l", "torso": "", "humerus_r": "upperarm_r", "ulna_r": "forearm_r",
@@ -64,7 +64,7 @@ def run() -> None:
     if root is None:
         raise NotMeasured(missing)
     errors = []
-    for trial in _TRIALS[1:] if quick() else _TRIALS:
+    for trial in TRIALS[1:] if quick() else TRIALS:
         with tempfile.TemporaryDirectory() as folder:
             shutil.copy(root / trial / "video.mp4", Path(folder, f"{trial}.mp4"))
             errors.append(_of_trial(root / trial, Path(folder), trial))
@@ -79,29 +79,32 @@ def run() -> None:
 
 
 def _of_trial(markers: Path, folder: Path, trial: str) -> Mapping[str, float]:
-    times, truth = _joints_of_file(markers / "sample_mocap.json")
-    rival = _against(*_joints_of_file(markers / "sample_mono.json"), times, truth)
-    stature = _stature(truth)
-    _kinefit("init", str(folder))
+    times, truth = joints_of_file(markers / "sample_mocap.json")
+    rival = against(*joints_of_file(markers / "sample_mono.json"), times, truth)
+    height = stature(truth)
+    command("init", str(folder))
     take = folder / "take.toml"
-    take.write_text(take.read_text().replace("# height = 1.75", f"height = {stature:.2f}  #"))
+    take.write_text(take.read_text().replace("# height = 1.75", f"height = {height:.2f}  #"))
     began = time.perf_counter()
-    _kinefit("track", str(take))
+    command("track", str(take))
     took = time.perf_counter() - began
     motion = read_motion(folder / "take-kinefit" / "motion.npz")
     take.write_text(take.read_text().replace("height = ", "# height = "))
-    _kinefit("track", str(take), "--pictures", "none", "--no-report")
+    command("track", str(take), "--pictures", "none", "--no-report")
     without = read_motion(folder / "take-kinefit" / "motion.npz")
     scale = json.loads((markers / "sample_mocap.json").read_text())["bodies"]["pelvis"]["scaleFactors"][0]
-    ours = _against(motion.times, _joints_of(motion, scale), times, truth, _std_of(motion))
+    ours = against(motion.times, joints_of(motion, scale), times, truth, std_of(motion))
     for name, found in (("kinefit", ours), ("OpenCap Monocular", rival)):
         told = ", ".join(f"{k.removeprefix('one_camera_')} {v:.3g}" for k, v in found.items() if v == v)
         print(f"{trial}, {name}: {told}", flush=True)
-    unstated = _against(without.times, _joints_of(without, scale), times, truth)
-    print(f"{trial}, no stature: relative {unstated['one_camera_relative']:.1f}, "
-          f"absolute {unstated['one_camera_absolute']:.1f}, height {without.body.stature:.2f} m", flush=True)
+    unstated = against(without.times, joints_of(without, scale), times, truth)
+    print(
+        f"{trial}, no stature: relative {unstated['one_camera_relative']:.1f}, "
+        f"absolute {unstated['one_camera_absolute']:.1f}, height {without.body.stature:.2f} m",
+        flush=True,
+    )
     lost, quality = motion.lost.mean(), motion.quality.mean()
-    print(f"{trial}: {lost:.1%} of segments lost, quality {quality:.2f}, height {stature:.2f} m", flush=True)
+    print(f"{trial}: {lost:.1%} of segments lost, quality {quality:.2f}, height {height:.2f} m", flush=True)
     print(f"{trial}: {len(motion)} frames in {took:.1f} s", flush=True)
     ours["one_camera_absolute_without_stature"] = unstated["one_camera_absolute"]
     return {**ours, "frames": len(motion), "seconds": took}
@@ -118,42 +121,44 @@ def _balancing() -> None:
         together.mkdir()
         for file in (*(root / "videos").glob("*.mp4"), root / "Calib_refined_static.toml"):
             shutil.copy(file, together)
-        _kinefit("init", str(together))
+        command("init", str(together))
         truth = _tracked(together / "take.toml")
-        x = _joints_of(truth, 1.0)
+        x = joints_of(truth, 1.0)
         for video in sorted(together.glob("*.mp4")):
             folder = Path(where, video.stem)
             (folder / "take-detect").mkdir(parents=True)
             shutil.copy(video, folder)
             shutil.copy(together / "take-detect" / f"{video.stem}.npz", folder / "take-detect")
-            _kinefit("init", str(folder))
+            command("init", str(folder))
             take = folder / "take.toml"
             take.write_text(take.read_text().replace("# height = 1.75", f"height = {truth.body.stature:.2f}  #"))
             motion = _tracked(take)
-            alone.append(_against(motion.times, _joints_of(motion, 1.0), truth.times, x, _std_of(motion)))
+            alone.append(against(motion.times, joints_of(motion, 1.0), truth.times, x, std_of(motion)))
     for name in ("relative", "absolute", "knee", "inside_least"):
         values = [one[f"one_camera_{name}"] for one in alone]
         print(f"# balancing trial, each camera alone: {name} {np.mean(values):.1f} ({np.round(values, 1)})", flush=True)
 
 
 def _tracked(take: Path) -> Motion:
-    _kinefit("track", str(take), "--person", "first", "--pictures", "none", "--no-report")
+    command("track", str(take), "--person", "first", "--pictures", "none", "--no-report")
     return read_motion(take.with_name("take-kinefit") / "motion.npz")
 
 
-def _kinefit(*words: str) -> None:
+def command(*words: str) -> None:
+    """Run a command."""
     done = subprocess.run([sys.executable, "-m", "kinefit", *words], capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(done.stderr)
 
 
-def _joints_of_file(path: Path) -> tuple[NDArray, NDArray]:
+def joints_of_file(path: Path) -> tuple[NDArray, NDArray]:
     """(F,) [s] and (F, 12, 3) [m]."""
     told = json.loads(path.read_text())
     return np.array(told["time"]), np.stack([np.array(told["bodies"][n]["translation"]) for n in _NAMES], axis=1)
 
 
-def _stature(x: NDArray) -> float:
+def stature(x: NDArray) -> float:
+    """[m] of a person whose joints these are (F, 12, 3), by thigh, shank and upper arm."""
     body = load_body("humanoid")
     rest = {name: body.tree.rest[body.tree.segment(s)] for name, s in _JOINTS.items() if s}
     pairs = [(_NAMES.index(a), _NAMES.index(b)) for a, b in _LONG]
@@ -162,7 +167,7 @@ def _stature(x: NDArray) -> float:
     return round(body.stature * seen / sum(float(np.linalg.norm(rest[a] - rest[b])) for a, b in _LONG), 2)
 
 
-def _joints_of(motion: Motion, scale: float) -> NDArray:
+def joints_of(motion: Motion, scale: float) -> NDArray:
     """(F, 12, 3) [m] where the model's bodies begin; pelvis and torso by how they lie to the hips in it."""
     tree, centres = motion.body.tree, motion.joint_centres
     x = np.stack([centres[:, tree.segment(s or "pelvis")] for s in _JOINTS.values()], axis=1)
@@ -173,14 +178,15 @@ def _joints_of(motion: Motion, scale: float) -> NDArray:
     return x
 
 
-def _std_of(motion: Motion) -> NDArray:
+def std_of(motion: Motion) -> NDArray:
     """(F, 12, 3) [m] of the joints in the world's axes."""
     return np.stack([motion.joint_std[:, motion.body.tree.segment(s or "pelvis")] for s in _JOINTS.values()], axis=1)
 
 
-def _against(
+def against(
     times: NDArray, x: NDArray, marker_times: NDArray, truth: NDArray, std: NDArray | None = None
 ) -> dict[str, float]:
+    """Figures of joints (F, 12, 3) [m] with their deviations against those by markers (G, 12, 3) [m]; times [s]."""
     lines = truth.reshape(len(truth), -1).T
 
     def laid(shift: float) -> tuple[NDArray, NDArray, NDArray]:

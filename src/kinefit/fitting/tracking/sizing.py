@@ -331,7 +331,7 @@ def _by_all(
     lengths = points is None and person.subject.fit is None and not person.joint
     left = of_all(
         person.recording, person.subject.body, size=size, lengths=lengths, surfaces=surfaces, steps=steps,
-        states=states,
+        states=states, height=height,
     )  # fmt: skip
     if left is not None:
         found = fit(left, steps, states)

@@ -1,0 +1,1 @@
+"""What other programs estimated, made right and improved."""
