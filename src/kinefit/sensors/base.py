@@ -298,7 +298,7 @@ class Sensor(ABC):
     def person_size(self, body: Body) -> tuple[float, float] | None:
         """Size of the person as a share of a body's and the standard deviation of its logarithm; None if it has none.
 
-        It counts beside the rows, which then have to fit a body of any size equally well.
+        Beside markers and one camera it counts in place of the rows, which then tell poses, but no lengths.
         """
         return None
 

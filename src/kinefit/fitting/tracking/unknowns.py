@@ -153,7 +153,7 @@ def of_all(
     """
     found: list[tuple[kinds.Parameters, NDArray]] = []
     if size and lengths and (surfaces or recording.markers or any(s.places_points for s in recording.sensors)):
-        known = kinds.SegmentScales(body, 1.0) if height else _size_by_sensors(body, recording)
+        known = kinds.SegmentScales(body, 1.0 if height else None)
         found.append((known, np.zeros(len(body.scale_groups))))
     if size and surfaces:
         found += [(shape, shape.mean) for shape in shape_of(body)]

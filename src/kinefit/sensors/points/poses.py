@@ -41,6 +41,7 @@ _SIDE = re.compile(r"^[lr]_|_[lr]$")
 _LEAN_STD = np.radians(5.0)  # of the vertical of another world: OpenCap Monocular's leans by 4 degrees
 _HEADING_STD = np.radians(20.0)  # of its heading as single poses place it, which may see a person turned
 _FOLLOWING_PATH_STD = 1.0  # [m] of the hips in another world: at 0.03 their path makes a stated stature 5 % too large
+_FULL_ERROR_DISTANCE = 0.4  # [m] along the bones, within which errors against the hips are in proportion: turns of 4 deg
 _PLACING_FRAMES = 100  # whose poses place another world; more change nothing
 
 
@@ -109,7 +110,8 @@ class PoseSensor(Sensor):
             raise ObservationError(f"{len(self.hips)} hips among the joints {', '.join(self.points)}", remedy=remedy)
         own = {_kind(place)[0]: self._free_axes(place) for place in self.points.values()}
         axes = [f"{kind} {axis}" for kind, free in own.items() for axis in free]
-        self.unknowns = {axis: Unknown(0.0, self.errors.offset) for axis in axes if self.errors.offset}
+        self.unknowns = {"size": Unknown(0.0, self.errors.size)}
+        self.unknowns |= {axis: Unknown(0.0, self.errors.offset) for axis in axes if self.errors.offset}
         if not self.is_placed:
             turns = [_HEADING_STD if axis in (up or "") else _LEAN_STD for axis in "xyz"]
             self.unknowns |= {f"r{axis}": Unknown(0.0, std) for axis, std in zip("xyz", turns)}
@@ -144,7 +146,7 @@ class PoseSensor(Sensor):
         a, b = x - hips, target - here
         a, b = a - np.outer(a @ e, e), b - np.outer(b @ e, e)
         turn = np.arctan2(np.sum(np.cross(a, b) @ e), np.sum(a * b))
-        R, size = se3.exp_so3(turn * e), self.size_on(scene.body)
+        R, size = se3.exp_so3(turn * e), self.size(scene)
         self.placings = np.vstack([self.placings, [turn, *(here - size * R @ hips)]])
 
     def T_world_file(self, scene: Scene) -> NDArray | None:
@@ -170,6 +172,11 @@ class PoseSensor(Sensor):
         kinds = [_kind(self.points[name]) for name in names]
         values = [[scene.value(self.name, f"{kind} {axis}", 0.0) for axis in "xyz"] for kind, _ in kinds]
         return np.reshape(values, (-1, 3)) * [(1.0, 1.0, side or 0.0) for _, side in kinds]
+
+    def size(self, scene: Scene) -> float:
+        """By how much the program's metres are too small; where that is not estimated, as the body's long bones say."""
+        known = scene.value(self.name, "size", np.nan)
+        return float(np.exp(known)) if np.isfinite(known) else self.size_on(scene.body)
 
     def size_on(self, body: Body) -> float:
         """How much larger a body is than the program's person, by their long bones; 1 without any."""
@@ -242,6 +249,15 @@ class PoseMeasurement(Measurement):
         points = self.of.places(scene.body, self.names)
         return PointSet(points.names, points.segments, points.points + self.of.offsets(self.names, scene))
 
+    def sigma_on(self, body: Body) -> NDArray:
+        """(K,) [m] standard deviations of the joints against the hips: less for those of the pelvis itself."""
+        points, bones = self.of.places(body, self.names), np.zeros(len(body.tree.segments))
+        for k, parent in enumerate(body.tree.parents):
+            if parent >= 0:
+                bones[k] = bones[parent] + np.linalg.norm(body.tree.rest[k] - body.tree.rest[parent])
+        away = bones[points.segments] + np.linalg.norm(points.points, axis=1)
+        return np.asarray(self.of.errors.sigma * np.clip(away / _FULL_ERROR_DISTANCE, 0.1, 1.0))
+
     def middle(self, x: NDArray) -> NDArray:
         """(...) the mean over the hips of values (K, ...) of all joints."""
         return np.asarray(x[[self.names.index(hip) for hip in self.of.hips]].mean(axis=0))
@@ -253,7 +269,7 @@ class PoseMeasurement(Measurement):
         seen_by = self.of.camera or (scene.rig.names[0] if len(scene.rig) == 1 else None)
         if seen_by is not None and self.names:
             eye = self.middle(scene.positions(self.on(scene))) - scene.rig[seen_by].centre_world
-        return PoseMatched(self, loss, T, eye, self.of.size_on(scene.body))
+        return PoseMatched(self, loss, T, eye)
 
     def hints(self, scene: Scene) -> Hints:
         """Places of the joints; none while the program's world is not placed."""
@@ -261,7 +277,7 @@ class PoseMeasurement(Measurement):
         if T is None or not self.names:
             return Hints()
         points = self.of.places(scene.body, self.names)
-        return Hints(points, se3.apply(T, self.of.size_on(scene.body) * self.x))
+        return Hints(points, se3.apply(T, self.of.size(scene) * self.x))
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,14 +290,12 @@ class PoseMatched(Matched):
     loss : Loss of a joint
     T_world_file : (4, 4) [m] the program's frame, as it was placed; None: there are no rows yet
     ray : (3,) from the camera to the hips in the world; None without a camera
-    size : float, by which the program's person is enlarged; by more on a larger body, with as much more deviation
     """
 
     measurement: PoseMeasurement
     loss: Loss
     T_world_file: NDArray | None
     ray: NDArray | None
-    size: float
     lasts = 0.9
 
     @property
@@ -294,12 +308,12 @@ class PoseMatched(Matched):
         m, errors = self.measurement, self.measurement.of.errors
         if self.T_world_file is None or not m.names:
             return []
-        points, size = m.on(scene), m.of.size_on(scene.body)
+        points, size = m.on(scene), m.of.size(scene)
         left, axes = self._left(scene, points), np.eye(3)
         if self.ray is not None:
             axes = se3.shortest_turn(np.array([0.0, 0.0, 1.0]), self.ray).T
-        std = np.full((len(m.names) + 1, 3), errors.sigma)
-        std[-1] = _FOLLOWING_PATH_STD if m.of.follows else errors.root
+        path = _FOLLOWING_PATH_STD if m.of.follows else errors.root
+        std = np.tile(np.append(m.sigma_on(scene.body), path)[:, None], 3)
         std[:, 2] *= 1.0 if self.ray is None else errors.depth_factor
         ids = [self.channels.index(name) for name in (*m.names, "root")]
 
@@ -309,8 +323,7 @@ class PoseMatched(Matched):
             middle = m.middle(J)
             return np.asarray((axes @ np.concatenate([J - middle, middle[None]])).reshape(3 * len(std), -1))
 
-        weight = std**-2.0
-        weight[:-1] *= (self.size / size) ** 2
+        weight = (size * std) ** -2.0  # in the program's metres: a larger size is not surer, and has no larger errors
         hips = points.segments[m.names.index(m.of.hips[0])]
         segments = np.repeat([*points.segments, scene.body.tree.parents[hips]], 3)
         residual = (left @ axes.T).ravel()
@@ -323,7 +336,7 @@ class PoseMatched(Matched):
             return []
         points = m.on(scene)
         values = self._left(scene, points)[:-1]
-        factor = self.loss.factor(np.square(values / m.of.errors.sigma).sum(axis=1))
+        factor = self.loss.factor(np.square(values / m.sigma_on(scene.body)[:, None]).sum(axis=1))
         return [Leftover(m.sensor, m.names, points.segments, values, factor, "m", scene.positions(points) + values)]
 
     def _left(self, scene: Scene, points: PointSet) -> NDArray:
@@ -334,6 +347,6 @@ class PoseMatched(Matched):
             se3.exp_so3(np.array([scene.value(m.sensor, f"r{axis}", 0.0) for axis in "xyz"]))
             @ self.T_world_file[:3, :3]
         )
-        seen, x = m.of.size_on(scene.body) * m.x @ R.T, scene.positions(points)
+        seen, x = m.of.size(scene) * m.x @ R.T, scene.positions(points)
         root = m.middle(seen) + self.T_world_file[:3, 3] - m.middle(x)
         return np.vstack([(seen - m.middle(seen)) - (x - m.middle(x)), root])
