@@ -63,7 +63,7 @@ class PoseErrors:
         Not positive.
     """
 
-    sigma: float = 0.03
+    sigma: float = 0.02
     depth_factor: float = 2.0
     root: float = 0.03
     offset: float = 0.0
