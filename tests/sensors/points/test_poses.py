@@ -7,11 +7,12 @@ import pytest
 from tests.fitting.tracking.movements import BODY, RATE, SENSOR, a_motion
 from tests.oracle import STATES, central_differences, state_of
 
-from kinefit import BodyTrackerFrame, Recording, track
+from kinefit import Recording, track
 from kinefit.errors import BodyError, ObservationError
+from kinefit.fitting.subject.parameters import SegmentScales
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.observations import MarkerFrame
+from kinefit.observations import BodyTrackerFrame, MarkerFrame
 from kinefit.sensors.points.poses import PoseErrors, PoseSensor
 from kinefit.sensors.scene import Scene
 from kinefit.simulation.figures import in_front
@@ -55,19 +56,40 @@ def test_rows_agree_with_central_differences(kind, up):
     assert len(rows) == 3 * (len(POINTS) + 1) and matched.channels == (*POINTS, "root")
 
 
-def test_a_body_of_any_size_fits_equally_well_and_the_size_is_measured_once():
+def test_a_body_of_any_size_fits_equally_well_with_the_file_as_much_larger():
     state = a_motion().state(5)
     frame = BodyTrackerFrame("poses", 0.0, tuple(POINTS), joints(state) @ se3.exp_so3(np.array([0.02, 0, 0])))
-    of = sensor(size=1.0, errors=PoseErrors(root=1e6))
+    of = sensor(size=1.0)
     squares = []
-    for scale in (1.0, 1.3):
+    for scale, stated in ((1.0, True), (1.3, True), (1.3, False)):
         body = BODY.scaled(np.full(len(BODY.scale_groups), scale))
         T = se3.transform(state.T_world_root[:3, :3], scale * state.T_world_root[:3, 3])
-        at = Scene(body, replace(state, T_world_root=T), Rig(()))
+        values = {"poses": {"size": float(np.log(scale))}} if stated else {}
+        at = Scene(body, replace(state, T_world_root=T), Rig(()), values=values)
         (rows,) = of.prepare(frame, at).match(scene(state), 0.03).rows(at)
         squares.append(float(rows.weight @ rows.residual**2))
         assert np.isclose(of.person_size(body)[0], 1.0 / scale)
-    assert squares[0] > 1e-3 and np.isclose(*squares, rtol=1e-6)
+    assert squares[0] > 1e-3 and np.allclose(squares, squares[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["length thigh", "length upperarm", "length trunk"])
+def test_lengths_move_the_rows_of_their_own_segments_alone(name):
+    """What the fit of the person takes for granted (`DofRows.segment`): else it would leave out what rows depend on."""
+    scales, state = SegmentScales(BODY), a_motion().state(5)
+    k, values = scales.names.index(name), {"poses": {"size": 0.1}}
+    frame = BodyTrackerFrame("poses", 0.0, tuple(POINTS), joints(state))
+    matched = sensor().prepare(frame, scene(state)).match(scene(state), 0.03)
+    bodies = [BODY, BODY.scaled(np.exp(0.1 * (np.arange(len(scales.names)) == k)))]
+    before, after = (matched.rows(scene(state, body, values=values))[0] for body in bodies)
+    moved = np.flatnonzero(np.abs(after.residual - before.residual) > 1e-9)
+    assert len(moved) and set(before.segment[moved].tolist()) <= scales.touches[k]
+
+
+def test_joints_of_the_pelvis_are_surer_than_those_of_limbs():
+    state = a_motion().state(5)
+    frame = BodyTrackerFrame("poses", 0.0, tuple(POINTS), joints(state))
+    sigma = dict(zip(POINTS, sensor().prepare(frame, scene(state)).sigmas(scene(state))))
+    assert sigma["lhip"] == 0.5 * PoseErrors.sigma and sigma["lknee"] == sigma["rwrist"] == PoseErrors.sigma
 
 
 def test_errors_are_larger_along_the_ray():

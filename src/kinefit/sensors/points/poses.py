@@ -1,9 +1,9 @@
 """Joints in space that another program estimated: where each lies against the middle of the hips, and the hips' path.
 
-What such a program does not know is asked of the take: the size of the person, a constant offset of each of its joints
-from the body's, and, where its world is not the take's, the transform between them. Its errors last over frames, and
-are larger along the ray of the camera. As of lifted landmarks (`lifted`), joints are enlarged to the size of the body,
-so that rows are of the same sum of squares for a body of any size, and the program's metres are one measurement of it.
+What such a program does not know of itself is asked of the take: by how much its metres are off, a constant offset of
+each of its joints from the body's, and, where its world is not the take's, the transform between them. Its errors last
+over frames, and are larger along the ray of the camera. Its size is an unknown of the sensor, not read off the body's
+bones in each row: rows of an arm would then depend on the lengths of legs.
 """
 
 from __future__ import annotations
@@ -249,14 +249,15 @@ class PoseMeasurement(Measurement):
         points = self.of.places(scene.body, self.names)
         return PointSet(points.names, points.segments, points.points + self.of.offsets(self.names, scene))
 
-    def sigma_on(self, body: Body) -> NDArray:
+    def sigmas(self, scene: Scene) -> NDArray:
         """(K,) [m] standard deviations of the joints against the hips: less for those of the pelvis itself."""
-        points, bones = self.of.places(body, self.names), np.zeros(len(body.tree.segments))
-        for k, parent in enumerate(body.tree.parents):
+        tree, points = scene.body.tree, self.of.places(scene.body, self.names)
+        bones = np.zeros(len(tree.segments))
+        for k, parent in enumerate(tree.parents):
             if parent >= 0:
-                bones[k] = bones[parent] + np.linalg.norm(body.tree.rest[k] - body.tree.rest[parent])
-        away = bones[points.segments] + np.linalg.norm(points.points, axis=1)
-        return np.asarray(self.of.errors.sigma * np.clip(away / _FULL_ERROR_DISTANCE, 0.1, 1.0))
+                bones[k] = bones[parent] + np.linalg.norm(tree.rest[k] - tree.rest[parent])
+        away = (bones[points.segments] + np.linalg.norm(points.points, axis=1)) / self.of.size(scene)
+        return np.asarray(self.of.errors.sigma * np.clip(away / _FULL_ERROR_DISTANCE, 0.5, 1.0))
 
     def middle(self, x: NDArray) -> NDArray:
         """(...) the mean over the hips of values (K, ...) of all joints."""
@@ -313,7 +314,7 @@ class PoseMatched(Matched):
         if self.ray is not None:
             axes = se3.shortest_turn(np.array([0.0, 0.0, 1.0]), self.ray).T
         path = _FOLLOWING_PATH_STD if m.of.follows else errors.root
-        std = np.tile(np.append(m.sigma_on(scene.body), path)[:, None], 3)
+        std = np.tile(np.append(m.sigmas(scene), path)[:, None], 3)
         std[:, 2] *= 1.0 if self.ray is None else errors.depth_factor
         ids = [self.channels.index(name) for name in (*m.names, "root")]
 
@@ -336,7 +337,7 @@ class PoseMatched(Matched):
             return []
         points = m.on(scene)
         values = self._left(scene, points)[:-1]
-        factor = self.loss.factor(np.square(values / m.sigma_on(scene.body)[:, None]).sum(axis=1))
+        factor = self.loss.factor(np.square(values / m.sigmas(scene)[:, None]).sum(axis=1))
         return [Leftover(m.sensor, m.names, points.segments, values, factor, "m", scene.positions(points) + values)]
 
     def _left(self, scene: Scene, points: PointSet) -> NDArray:
