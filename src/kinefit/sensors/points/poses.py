@@ -41,7 +41,7 @@ _SIDE = re.compile(r"^[lr]_|_[lr]$")
 _LEAN_STD = np.radians(5.0)  # of the vertical of another world: OpenCap Monocular's leans by 4 degrees
 _HEADING_STD = np.radians(20.0)  # of its heading as single poses place it, which may see a person turned
 _FOLLOWING_PATH_STD = 1.0  # [m] of the hips in another world: at 0.03 their path makes a stated stature 5 % too large
-_FULL_ERROR_DISTANCE = 0.4  # [m] along the bones, within which errors against the hips are in proportion: turns of 4 deg
+_FULL_ERROR_DISTANCE = 0.4  # [m] along the bones: nearer to the hips errors are less in proportion, down to half
 _PLACING_FRAMES = 100  # whose poses place another world; more change nothing
 
 
