@@ -118,7 +118,9 @@ def known_names(body: Body, rig: Rig, keypoints: Sequence[Keypoints]) -> dict[st
     return names
 
 
-def make_channels(body: Body, rig: Rig, keypoints: Sequence[Keypoints], sigma: Sequence[float]) -> Channels:
+def make_channels(
+    body: Body, rig: Rig, keypoints: Sequence[Keypoints], sigma: Sequence[float]
+) -> Channels:
     """Channels of one person.
 
     Parameters
