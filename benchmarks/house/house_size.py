@@ -93,7 +93,8 @@ def imported_lines(tree: ast.AST) -> int:
 @cache
 def house_size() -> Counter[str]:
     """Size of the whole package."""
-    return sum((source_size(path.read_text("utf-8"), parsed(path)) for path in sorted(PACKAGE.rglob("*.py"))), Counter())
+    sizes = (source_size(path.read_text("utf-8"), parsed(path)) for path in sorted(PACKAGE.rglob("*.py")))
+    return sum(sizes, Counter())
 
 
 @cache
