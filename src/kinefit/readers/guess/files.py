@@ -23,8 +23,7 @@ from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, SUFFI
 from kinefit.readers.depth.images import PICTURES, natural, npy_source, picture_source
 from kinefit.readers.depth.streams import has_depth_track
 from kinefit.readers.guess.names import camera_of
-from kinefit.readers.landmarks.keypoint_sets import SPLIT, other_keypoints
-from kinefit.readers.landmarks.keypoints import decode_openpose, read_keypoints
+from kinefit.readers.landmarks.keypoints import decode_openpose, other_keypoints, read_keypoints
 from kinefit.readers.plugins import CALIBRATIONS, KEYPOINTS, MARKERS
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.videos.video import ENDINGS, ImageFolder, Video
@@ -315,7 +314,7 @@ def stand_in(path: Path) -> str:
 
 def find_markers(files: list[Path], faults: list[KinefitError]) -> list[Path]:
     """Files of markers; errors of plug-ins are added to `faults`."""
-    return [path for path in files if MARKERS.name_of(path, faults)]
+    return [path for path in files if MARKERS.name_of(path, faults) and not KEYPOINTS.name_of(path, faults)]
 
 
 def find_keypoints(files: list[Path], faults: list[KinefitError]) -> tuple[list[KeypointFile], list[str]]:
@@ -333,21 +332,27 @@ def find_keypoints(files: list[Path], faults: list[KinefitError]) -> tuple[list[
     for path in files:
         suffix = path.suffix.lower()
         shape = _array_shape(path) if suffix == ".npy" else None
-        if shape is not None and len(shape) == 3 and shape[1:] in ((33, 3), (75, 3)):
-            found.append(KeypointFile(path, "mediapipe", shape[0], shape[1]))
-        elif suffix == ".csv" and (frames := _caliscope_frames(path)):
-            found.append(KeypointFile(path, "caliscope", frames, 33))
-        elif (format := KEYPOINTS.name_of(path, faults)) and KEYPOINTS.plugins(format):
+        format = KEYPOINTS.name_of(path, faults)
+        if shape is not None and format in ("mediapipe", "freemocap"):
+            found.append(KeypointFile(path, format, *shape[-3:-1]))
+        elif format == "caliscope":
+            found += [KeypointFile(path, format, frames, 33)] if (frames := _caliscope_frames(path)) else []
+        elif format == "deeplabcut" and path.with_suffix(".csv") in files and suffix == ".h5":
+            continue  # both are of one result
+        elif format:
             try:
                 record = read_keypoints(path, format=format, camera=path.stem, rate=1.0)
                 found.append(KeypointFile(path, format, len(record), len(record.names)))
             except KinefitError as error:
                 faults.append(error)
         elif shape is not None and len(shape) >= 3 and shape[-1] in (2, 3):
-            known = "landmarks are read as (frames, 33, 3), or (frames, 75, 3) with hands"
+            known = "landmarks in images are read as (frames, 33, 3), or (frames, 75, 3) with hands"
             remarks.append(f"{path.name}: an array of shape {shape}; {known}")
-        elif suffix in _MAYBE_KEYPOINTS and (other := other_keypoints(path)):
-            remarks.append(f"{path.name}: {other}; not used. {SPLIT}")
+        elif suffix in _MAYBE_KEYPOINTS:
+            try:
+                remarks += [f"{path.name}: {other}; not used"] if (other := other_keypoints(path)) else []
+            except KinefitError as error:
+                faults.append(error)
     return found, remarks
 
 
@@ -356,7 +361,7 @@ def _openpose_points(numbered: list[Path]) -> int | None:
     is_openpose = False
     for path in numbered:
         try:
-            people = decode_openpose(path.read_bytes()).people
+            people = decode_openpose(path.read_bytes())
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OSError):
             if not is_openpose:
                 return None

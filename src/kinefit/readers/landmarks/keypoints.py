@@ -1,43 +1,49 @@
-"""Read 2D keypoints of detectors: OpenPose json folders, MediaPipe arrays, caliscope tables."""
+"""Read 2D keypoints of detectors: OpenPose json folders, MediaPipe and FreeMoCap arrays, caliscope tables."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from importlib import import_module
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit._files import read_bytes, read_npy, read_table
+from kinefit._files import npy_header, read_bytes, read_npy, read_table
 from kinefit._mapped import kept
-from kinefit.errors import FileError, ObservationError, choices, names_file
+from kinefit.errors import FileError, ObservationError, choices, extra, names_file
 from kinefit.observations import Keypoints
 from kinefit.observations.arrays import sealed
 from kinefit.observations.clocks import frames_by_name
 from kinefit.readers.depth.images import natural
-from kinefit.readers.landmarks import keypoint_sets
 from kinefit.readers.landmarks.keypoint_sets import (
     FACE_POINTS,
+    FACE_SET,
     HAND_POINTS,
     KEYPOINT_SETS,
     MEDIAPIPE_SETS,
     OPENPOSE_HANDS,
+    SET_OF_COUNT,
     cut_frames,
     face_mesh,
+    frame_numbers,
     in_right_order,
     keypoint_names,
     keypoint_record,
+    stacked,
 )
 from kinefit.readers.plugins import KEYPOINTS, FileFormat
 
 if TYPE_CHECKING:
     from kinefit.geometry.camera import ImageFrame
 
+_Decoded = TypeVar("_Decoded")
 _MISSING_HAND = [0.0] * (3 * HAND_POINTS)
 _FRAME_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.IGNORECASE)
 
@@ -55,11 +61,34 @@ class OpenPosePerson(msgspec.Struct):
         return [*self.pose_keypoints_2d, *left, *right]
 
 
-class _OpenPoseFrame(msgspec.Struct):
-    people: list[OpenPosePerson]
+class OpenPoseFrame(msgspec.Struct):
+    """All people of a frame; an empty object is nobody (Pose2Sim's `pose-associated`)."""
+
+    people: list[msgspec.Raw]
+
+    def persons(self) -> list[OpenPosePerson]:
+        """Those who are there; raises msgspec.DecodeError."""
+        return [_PERSON.decode(one) for one in self.people if bytes(one)[1:-1].strip()]
 
 
-decode_openpose = msgspec.json.Decoder(_OpenPoseFrame).decode
+_PERSON, _FRAME = msgspec.json.Decoder(OpenPosePerson), msgspec.json.Decoder(OpenPoseFrame)
+_OLD_KEYS = {  # of OpenPose before 1.2, and of AlphaPose's form "cmu": today's
+    b'"pose_keypoints"': b'"pose_keypoints_2d"', b'"body_parts"': b'"pose_keypoints_2d"',
+    b'"hand_left_keypoints"': b'"hand_left_keypoints_2d"', b'"hand_right_keypoints"': b'"hand_right_keypoints_2d"',
+    b'"bodies"': b'"people"', b'"joints"': b'"pose_keypoints_2d"',
+}  # fmt: skip
+
+
+def with_new_keys(raw: bytes) -> bytes:
+    """JSON of OpenPose's form with the keys that it has today."""
+    for old, new in _OLD_KEYS.items():
+        raw = raw.replace(old, new)
+    return raw
+
+
+def decode_openpose(raw: bytes) -> list[OpenPosePerson]:
+    """All people of one frame; raises msgspec.DecodeError."""
+    return _FRAME.decode(with_new_keys(raw)).persons()
 
 
 @checked
@@ -101,9 +130,9 @@ def read_openpose(
     """
     folder = Path(folder)
     paths, start = cut_frames(_numbered_files(folder), frames, folder)
-    read = [_read_people(path) for path in paths]
+    read = [decoded(path, decode_openpose, "openpose") for path in paths]
     first = next((len(people[0].pose_keypoints_2d) // 3 for people in read if people), 0)
-    named = keypoint_set or keypoint_sets.SET_OF_COUNT.get(first, "BODY_25B")
+    named = keypoint_set or SET_OF_COUNT.get(first, "BODY_25B")
     names = keypoint_names(named)
     people = [_numbers(persons, path, named) for persons, path in zip(read, paths, strict=True)]
     if folder.is_dir() and not any(map(len, people)):
@@ -111,9 +140,7 @@ def read_openpose(
             f"no person is detected in any of the {len(paths)} frames of camera {camera}",
             remedy="Check that the detector ran on this camera's video, or remove this camera.",
         )
-    data = np.zeros((len(people), max(map(len, people)), len(names), 3))
-    for row, persons in zip(data, people, strict=True):
-        row[: len(persons)] = persons
+    data = stacked(people, len(names))
     record = keypoint_record(data, camera, named, rate, time_offset, start, folder, image_frame)
     return in_right_order(record, stated=keypoint_set is not None)
 
@@ -172,7 +199,7 @@ def read_mediapipe(
 
 
 _CALISCOPE_HANDS = (100, 200)  # first indices of the right and of the left hand
-_GAPS, _PORTS = 20, 100  # indices for each that is there, and cameras, beyond which a table is damaged
+_PORTS = 100  # cameras, beyond which a table is damaged
 
 
 @checked
@@ -207,19 +234,15 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
     table = table[((table[:, 3] < pose) | right | left) & np.isfinite(table).all(axis=1)]
     if not len(table):
         raise ObservationError("no landmark of the body in this table", remedy="Track the whole pose.")
-    numbers = table[:, (0, 1, 3)]
-    if (wrong := (numbers < 0) | (numbers > 2**31) | (numbers % 1 != 0)).any():
-        row, k = np.argwhere(wrong)[0]
-        problem = f"{('sync_index', 'port', 'point_id')[k]} = {numbers[row, k]:g}"
-        raise ObservationError(problem, remedy="They are whole numbers from 0 on: export the table again.")
-    frame, port, point = numbers.astype(int).T
+    frame, port, point = (
+        frame_numbers(table[:, k], columns[k], from_first=columns[k] == "sync_index") for k in (0, 1, 3)
+    )
     keypoint_set = MEDIAPIPE_SETS[int(point.max() >= pose)]
     for k, begin in enumerate(_CALISCOPE_HANDS):  # the left hand comes first in the set
         point[(point >= begin) & (point < begin + HAND_POINTS)] += pose + (1 - k) * HAND_POINTS - begin
-    frame = frame - frame.min()
-    if frame.max() > _GAPS * len(np.unique(frame)) + 1000 or len(np.unique(port)) > _PORTS:
-        problem = f"{len(np.unique(frame))} frames of {len(np.unique(port))} ports in {frame.max() + 1} of sync_index"
-        raise ObservationError(problem, remedy="Indices follow each other: export the table again.")
+    if len(np.unique(port)) > _PORTS:
+        problem = f"{len(np.unique(port))} ports"
+        raise ObservationError(problem, remedy="A port is a camera: export the table again.")
     if rate is None:
         first = port == port[0]
         _, at = np.unique(frame[first], return_index=True)
@@ -235,6 +258,46 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
 
 @checked
 @names_file
+def read_freemocap(path: str | PathLike[str], *, rate: float, face: bool = False) -> dict[str, Keypoints]:
+    """Read the landmarks of all cameras that FreeMoCap recorded: `mediapipe2dData_..._pixelXY.npy`.
+
+    Parameters
+    ----------
+    path : path
+        (C, F, K, 3): x, y [px], and a depth, which is ignored; NaN where undetected. K is 33 (pose), 75 (with the
+        right, then the left hand) or 553 (with the face mesh).
+    rate : float [Hz]
+    face : whether to read the face mesh in place of pose and hands
+
+    Returns
+    -------
+    {"cam_0": Keypoints, ...}
+        In the order of the array; confidence is 1 where detected.
+
+    Raises
+    ------
+    FileError, ObservationError
+        Not an array file; another shape; no landmark in it; no face.
+    """
+    data, pose = read_npy(Path(path), remedy="Process the videos again."), len(KEYPOINT_SETS["MEDIAPIPE_33"])
+    left, end = pose + HAND_POINTS, pose + 2 * HAND_POINTS
+    counts = (end + max(FACE_POINTS),) if face else (pose, end, end + max(FACE_POINTS))
+    if data.dtype.kind != "f" or data.ndim != 4 or data.shape[3] != 3 or data.shape[2] not in counts:
+        remedy = "Give FreeMoCap's array of 2D landmarks, (cameras, frames, 33, 75 or 553, 3); with the face 553."
+        raise ObservationError(f"landmarks have shape {data.shape}", remedy=remedy)
+    order = [*range(end, data.shape[2])] if face else [*range(pose), *range(left, end), *range(pose, left)]
+    chosen = data[:, :, order[: data.shape[2]]]
+    seen = np.isfinite(chosen[..., :2]).all(axis=-1, keepdims=True)
+    whole = np.where(seen, np.concatenate([chosen[..., :2], seen], axis=-1), 0.0)
+    name = FACE_SET if face else MEDIAPIPE_SETS[int(data.shape[2] > pose)]
+    return {
+        f"cam_{k}": keypoint_record(of[:, None], f"cam_{k}", name, rate, 0.0, 0, Path(path), None)
+        for k, of in enumerate(whole)
+    }
+
+
+@checked
+@names_file
 def read_keypoints(
     path: str | PathLike[str], *, format: str | None = None, camera: str, rate: float | None = None,
     time_offset: float = 0.0, image_frame: ImageFrame | None = None, **options: Any,
@@ -244,26 +307,34 @@ def read_keypoints(
     Parameters
     ----------
     path : path
-    format : "openpose", "mediapipe", "caliscope" or a plug-in's, optional
-        Default: a folder is OpenPose's, a .npy file MediaPipe's, another file of the plug-in that recognises it. Of
-        caliscope the port of the camera's last number.
+    format : "openpose", "alphapose" (and COCO's results), "mmpose", "mediapipe", "freemocap", "caliscope", \
+            "deeplabcut", "sleap", "sports2d" or a plug-in's, optional
+        Default: the one that recognises the folder or file. Of caliscope and FreeMoCap the camera of the last number
+        in the camera's name.
     camera, rate, time_offset, image_frame
         As in `read_openpose` and `read_mediapipe`; caliscope's tables state their rate.
     **options
-        More of `read_openpose` or `read_mediapipe`.
+        keypoint_set : of all but caliscope. Default: by the number of points or by their names; for DeepLabCut, SLEAP
+        and Sports2D any set of the body, whose points then have the names in the file.
+        names : {name in the file: point of the set}, "" to leave a point out: of DeepLabCut, SLEAP and Sports2D.
+        frames : of `read_openpose` and `read_mediapipe`.
 
     Raises
     ------
     ObservationError, FileError
-        An unknown format; and what those raise.
+        An unknown format, a file of another or of none; names of no point; and what those raise.
     PluginError
         A plug-in fails.
     """
     path = Path(path)
-    format = format or KEYPOINTS.name_of(path) or "mediapipe"
-    reader = KEYPOINTS.get(format, ObservationError)
+    format = format or KEYPOINTS.name_of(path)
+    if format is None and path.suffix.lower() != ".npy" and path.is_file():
+        raise ObservationError(
+            f"{other_keypoints(path) or 'a file of another kind'}, no keypoints of a known form", remedy=_READ
+        )
+    reader = KEYPOINTS.get(format or "mediapipe", ObservationError)
     if reader.plugin is None and path.is_file():
-        keypoint_sets.refuse_other_keypoints(path)
+        refuse_another(path, format)
     record: Keypoints = reader.call(
         "read", path, camera=camera, rate=rate, **options, what=f"Keypoints of the camera '{camera}' at {rate} Hz",
         valid=lambda one: isinstance(one, Keypoints) and one.camera == camera and rate in (None, one.rate),
@@ -276,13 +347,60 @@ def _is_caliscope(path: Path) -> bool:
     return path.suffix.lower() == ".csv" and b"sync_index" in read_bytes(path, 4096)
 
 
+def _is_array(dimensions: int, *last: tuple[int, int]) -> Callable[[Path], bool]:
+    """Whether a file is an array of numbers with as many dimensions, of which the last two are one of these."""
+
+    def recognise(path: Path) -> bool:
+        header = npy_header(path) if path.suffix.lower() == ".npy" else None
+        shape = header[0] if header is not None and header[1].kind in "fiu" else ()
+        return len(shape) == dimensions and shape[-2:] in last
+
+    return recognise
+
+
 @names_file
+def _of_number(cameras: Mapping[str, Keypoints], camera: str) -> Keypoints:
+    """The keypoints of the camera that the last number in a name counts."""
+    numbers = re.findall(r"\d+", camera)
+    found = cameras.get(f"cam_{int(numbers[-1][-18:])}" if numbers else "")
+    if found is None:
+        raise ObservationError(choices("camera in this file named", camera, cameras))
+    return replace(found, camera=camera)
+
+
 def _caliscope_camera(path: Path, *, camera: str, rate: float | None) -> Keypoints:
-    ports, numbers = read_caliscope_csv(path, rate=rate), re.findall(r"\d+", camera)
-    port = ports.get(f"cam_{int(numbers[-1][-18:])}" if numbers else "")
-    if port is None:
-        raise ObservationError(choices("camera in this table named", camera, ports))
-    return replace(port, camera=camera)
+    return _of_number(read_caliscope_csv(path, rate=rate), camera)
+
+
+def _freemocap_camera(path: Path, *, camera: str, rate: float | None, keypoint_set: str | None = None) -> Keypoints:
+    """At 1 Hz without a rate, which the file does not state."""
+    return _of_number(read_freemocap(path, rate=rate or 1.0, face=keypoint_set == FACE_SET), camera)
+
+
+_OTHER_FILES = {  # what such a file has near its start, after spaces: what it is
+    rb"\{(?=.*\"(?:annotations|categories|file_name)\")": "COCO's annotations of many images",
+    rb"\x89HDF\r\n": "an HDF5 file that is none of DeepLabCut's or SLEAP's",
+    rb"\x93NUMPY": "an array of another shape than landmarks in images have",
+}
+_READ = (
+    "Give OpenPose's folder of one json file a frame, or a file of AlphaPose, MMPose, MediaPipe, FreeMoCap (2D), "
+    "Caliscope, DeepLabCut or SLEAP; others by a package (page own-sensor)."
+)
+
+
+def other_keypoints(path: Path) -> str:
+    """What a file of keypoints that are not read is; "" for any other file.
+
+    Raises
+    ------
+    ObservationError
+        It is HDF5, and the package that reads it is not installed.
+    """
+    start = read_bytes(path, 4096).lstrip()
+    if start.startswith(b"\x89HDF"):
+        with extra("hdf5", "HDF5 files are read by the package h5py", ObservationError, file=path):
+            import_module("h5py")
+    return next((what for pattern, what in _OTHER_FILES.items() if re.match(pattern, start, re.DOTALL)), "")
 
 
 def _numbered_files(folder: Path) -> list[Path]:
@@ -298,7 +416,7 @@ def _numbered_files(folder: Path) -> list[Path]:
         raise FileError("there are no json files in this folder", remedy=remedy)
     for path in files:
         if not _FRAME_NUMBER.search(path.name):
-            keypoint_sets.refuse_other_keypoints(path)
+            refuse_another(path, "openpose")
             raise ObservationError("no frame number in this name", file=path, remedy="Expected NAME_0012.json.")
     numbered = frames_by_name([path.name.lower().replace("_keypoints", "") for path in files], "frames")
     numbered.refuse_gaps("frames")
@@ -309,16 +427,26 @@ def _numbered_files(folder: Path) -> list[Path]:
     return files
 
 
-def _read_people(path: Path) -> list[OpenPosePerson]:
-    """All people of one frame."""
+def decoded(path: Path, decode: Callable[[bytes], _Decoded], format: str) -> _Decoded:
+    """What a json file of a format holds; ObservationError if it is of another one, or broken."""
     raw = read_bytes(path)
     try:
-        return decode_openpose(raw).people
+        return decode(raw)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        keypoint_sets.refuse_other_keypoints(path)
+        refuse_another(path, format)
         infinite = re.search(rb"[\[,:]\s*-?(NaN|Inf)", raw, re.IGNORECASE)
         problem = "NaN or infinity among the keypoints" if infinite else f"broken json ({error})"
         raise ObservationError(problem, file=path, remedy="Run the detector again on this frame.") from error
+
+
+def refuse_another(path: Path, format: str | None) -> None:
+    """Raise ObservationError for a file that is recognised as of another format, or as nothing that is read."""
+    found = KEYPOINTS.name_of(path, [])
+    if found not in (None, format):
+        problem = f"{KEYPOINTS.get(str(found)).summary}, not {format}"
+        raise ObservationError(problem, file=path, remedy=f'Write format = "{found}" in place of "{format}".')
+    if not found and (other := other_keypoints(path)):
+        raise ObservationError(f"{other}, which are not read", file=path, remedy=_READ)
 
 
 def _numbers(people: list[OpenPosePerson], path: Path, keypoint_set: str) -> NDArray:
@@ -341,7 +469,13 @@ def _numbers(people: list[OpenPosePerson], path: Path, keypoint_set: str) -> NDA
 
 
 OPENPOSE = FileFormat("OpenPose (Cao et al. 2021, IEEE TPAMI 43:172)", (), read_openpose, Path.is_dir)
-MEDIAPIPE = FileFormat("MediaPipe Pose (Bazarevsky et al. 2020, BlazePose)", (".npy",), read_mediapipe)
+MEDIAPIPE = FileFormat(
+    "MediaPipe Pose (Bazarevsky et al. 2020, BlazePose)", (".npy",), read_mediapipe, _is_array(3, (33, 3), (75, 3))
+)
+FREEMOCAP = FileFormat(
+    "the landmarks in all images of FreeMoCap", (".npy",), _freemocap_camera,
+    _is_array(4, (33, 3), (75, 3), (553, 3)), has_all_cameras=True,
+)
 CALISCOPE = FileFormat(
     "the landmarks that Caliscope recorded", (".csv",), _caliscope_camera, _is_caliscope, has_all_cameras=True
 )

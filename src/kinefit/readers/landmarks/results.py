@@ -1,0 +1,148 @@
+"""Read 2D keypoints of detectors that write all frames of a video into one json file: AlphaPose, COCO, MMPose."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit._arguments import checked
+from kinefit._files import read_bytes
+from kinefit.errors import ObservationError, names_file
+from kinefit.observations import Keypoints
+from kinefit.readers.landmarks.keypoint_sets import (
+    KEYPOINT_SETS,
+    SET_OF_COUNT,
+    frame_numbers,
+    in_right_order,
+    keypoint_names,
+    keypoint_record,
+    stacked,
+)
+from kinefit.readers.landmarks.keypoints import OpenPoseFrame, decoded, with_new_keys
+from kinefit.readers.plugins import FileFormat
+
+Row = tuple[int, list[float]]  # frame, and x, y [px], confidence of each point of one person; none of nobody
+_OF_MORE = {136: "HALPE_26", 68: "HALPE_26"}  # numbers of points that begin with those of a set: with face and hands
+_VIDEO_IMAGE = re.compile(r"(0|[1-9]\d*)\.\w+")  # name that AlphaPose gives to a frame of a video: "0.jpg"
+_MAX_START_BYTES = 4096  # in which the keys of a form are
+
+
+class _Person(msgspec.Struct):
+    """A person of AlphaPose's results, whose form is that of COCO's."""
+
+    image_id: str | int
+    keypoints: list[float]
+
+
+class _Instance(msgspec.Struct):
+    """A person of MMPose."""
+
+    keypoints: list[list[float]]
+    keypoint_scores: list[float]
+
+
+class _Instances(msgspec.Struct):
+    frame_id: int
+    instances: list[_Instance]
+
+
+class _Predictions(msgspec.Struct):
+    instance_info: list[_Instances]
+
+
+_ALPHAPOSE = msgspec.json.Decoder(list[_Person] | dict[str, OpenPoseFrame])
+_MMPOSE = msgspec.json.Decoder(list[_Instances] | _Predictions)
+
+
+def _alphapose(raw: bytes) -> list[Row]:
+    found = _ALPHAPOSE.decode(with_new_keys(raw))
+    if isinstance(found, dict):
+        people = [(name, person.pose_keypoints_2d) for name, frame in found.items() for person in frame.persons()]
+    else:
+        people = [(str(one.image_id), one.keypoints) for one in found]
+    return list(zip(_frames([name for name, _ in people]), [numbers for _, numbers in people], strict=True))
+
+
+def _frames(names: Sequence[str]) -> list[int]:
+    """Frame of each image, from its name: of a video ("0.jpg") its number, else counted from the smallest number."""
+    numbers = [int(re.findall(r"\d+", name)[-1][-18:]) if re.search(r"\d", name) else -1 for name in names]
+    if min(numbers, default=0) < 0:
+        problem = f"no frame number in the name of the image {names[numbers.index(-1)]!r}"
+        raise ObservationError(problem, remedy="Run the detector on the video, or on images that are numbered.")
+    first = 0 if all(map(_VIDEO_IMAGE.fullmatch, names)) else min(numbers, default=0)
+    return [number - first for number in numbers]
+
+
+def _mmpose(raw: bytes) -> list[Row]:
+    found = _MMPOSE.decode(raw)
+    frames = found if isinstance(found, list) else found.instance_info
+    first, rows = min((frame.frame_id for frame in frames), default=0), list[Row]()  # all frames are in the file
+    for frame in frames:
+        rows.append((frame.frame_id - first, []))
+        for one in frame.instances:
+            if len(one.keypoints) != len(one.keypoint_scores) or any(len(point) != 2 for point in one.keypoints):
+                problem = f"{len(one.keypoints)} points and {len(one.keypoint_scores)} scores, or points in 3D"
+                remedy = "Save the predictions of a network of 2D keypoints."
+                raise ObservationError(problem, place=f"frame {frame.frame_id}", remedy=remedy)
+            numbers = [v for point, score in zip(one.keypoints, one.keypoint_scores) for v in (*point, score)]
+            rows.append((frame.frame_id - first, numbers))
+    return rows
+
+
+def _reader(format: str, rows_of: Callable[[bytes], list[Row]]) -> Callable[..., Keypoints]:
+    @checked
+    @names_file
+    def read(path: Path, *, camera: str, rate: float, keypoint_set: str | None = None) -> Keypoints:
+        """The keypoints of a file, all people in the order of the file; see `read_keypoints`."""
+        rows = decoded(path, rows_of, format)
+        if not any(numbers for _, numbers in rows):
+            problem = f"no person is detected in any frame of camera {camera}"
+            raise ObservationError(problem, remedy="Check that the detector ran on this camera's video.")
+        count = next(len(numbers) for _, numbers in rows if numbers) // 3
+        named = keypoint_set or SET_OF_COUNT.get(count) or _OF_MORE.get(count, "")
+        if not named:
+            problem, sets = f"people of {count} points", ", ".join(f"{k} {n}" for k, n in SET_OF_COUNT.items())
+            raise ObservationError(problem, remedy=f"There are sets of {sets}. Run the detector with one of these.")
+        record = keypoint_record(_by_frame(rows, count, named), camera, named, rate, 0.0, 0, path, None)
+        return in_right_order(record, stated=keypoint_set is not None)
+
+    return read
+
+
+def _by_frame(rows: Sequence[Row], count: int, keypoint_set: str) -> NDArray:
+    """(F, P, K, 3) x, y [px], confidence."""
+    points = len(keypoint_names(keypoint_set))
+    if _OF_MORE.get(count, "") != keypoint_set and points != count:
+        fitting = [name for name in KEYPOINT_SETS if len(KEYPOINT_SETS[name]) == count]
+        problem = f"{count} points where {keypoint_set} has {points}"
+        raise ObservationError(problem, remedy=f"This number fits: {', '.join(fitting) or 'no set'}.")
+    frames = frame_numbers([frame for frame, _ in rows], "frames").tolist()
+    people: list[list[NDArray]] = [[] for _ in range(max(frames) + 1)]
+    for frame, numbers in rows:
+        if numbers and len(numbers) != 3 * count:
+            problem = f"{len(numbers)} numbers where other people have {count} x 3"
+            raise ObservationError(problem, place=f"frame {frame}", remedy="Run one detector on all frames.")
+        people[frame] += [np.array(numbers).reshape(count, 3)[:points]] if numbers else []
+    return stacked([np.array(persons).reshape(-1, points, 3) for persons in people], points)
+
+
+def _begins(*patterns: bytes) -> Callable[[Path], bool]:
+    """Whether the start of a file has one of these patterns, after spaces."""
+    known = re.compile(rb"\s*(?:" + b"|".join(patterns) + b")", re.DOTALL)
+    return lambda path: path.is_file() and bool(known.match(read_bytes(path, _MAX_START_BYTES)))
+
+
+ALPHAPOSE = FileFormat(
+    "all frames' people by AlphaPose (Fang et al. 2022, IEEE TPAMI 45:7157), or COCO's results", (".json",),
+    _reader("alphapose", _alphapose),
+    _begins(rb'\[\s*\{(?=.*"image_id")(?=.*"keypoints")', rb'\{\s*"[^"]*\.(?i:jpe?g|png|bmp|tiff?)"\s*:'),
+)
+MMPOSE = FileFormat(
+    "all frames' people by MMPose (OpenMMLab 2020)", (".json",), _reader("mmpose", _mmpose),
+    _begins(rb'\[\s*\{\s*"frame_id"\s*:', rb'\{\s*"(?:meta_info|instance_info)"\s*:'),
+)
