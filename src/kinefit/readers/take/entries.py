@@ -147,7 +147,7 @@ class KeypointsEntry(TakeEntry, frozen=True, kw_only=True):
     stream: Path | None = None  # of `kinefit live`, in place of a file: a folder that OpenPose's JSON files come into
     format: str = "openpose"  # of `KEYPOINTS`, or "detect" or "skin"
     set: str | None = None  # default: by the number or the names of the points, MEDIAPIPE_33, HANDS of skin
-    names: dict[str, str] = msgspec.field(default_factory=dict)  # {name in the file: point of the set, "" for none}
+    names: dict[str, str] | None = None  # {name in the file: point of the set, "" for none}
     frame: Literal["calibration", "video"] | None = None  # image frame of the coordinates; needed where the two differ
     rate: Rate | None = None  # [Hz]; default: the camera's video, or the take
     sigma: Pixels = KEYPOINT_SIGMA  # [px] standard deviation, in the calibration's image
