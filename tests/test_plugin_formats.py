@@ -144,7 +144,8 @@ def test_formats_of_another_distribution_go_from_init_to_export(site, recording,
     assert code == 0, said
     text = recording.read_text()
     assert text.count("[[keypoints]]") == 4 and "COCO_17, 4 cameras: used" in said
-    assert re.search(r'^format = "lab" +# sure: of the plug-in kinefit-formats 0\.1: tables of the laboratory$', text, re.M)
+    comment = r"sure: of the plug-in kinefit-formats 0\.1: tables of the laboratory"
+    assert re.search(rf'^format = "lab" +# {comment}$', text, re.M)
     code, said = site.kinefit("check", recording)
     assert code == 0, said
     out = tmp_path / "out"

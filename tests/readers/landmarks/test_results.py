@@ -119,7 +119,7 @@ ROW = np.tile([[[100.0, 200.0, 0.9]]], (2, 17, 1))
 IN_3D = [{"frame_id": 0, "instances": [{"keypoints": [[1.0, 2.0, 3.0]] * 17, "keypoint_scores": [0.9] * 17}]}]
 BAD = {
     "no frame number in the name of the image 'a.jpg'": alphapose(ROW, "a.jpg"),
-    "2 frames in 100000001 of frames": [one | {"image_id": n} for n, one in zip(("0.jpg", "100000000.jpg"), alphapose(ROW))],
+    "2 frames in 100000001 of frames": [alphapose(ROW)[0], alphapose(ROW)[1] | {"image_id": "100000000.jpg"}],
     "people of 19 points": alphapose(np.tile(ROW[:, :1], (1, 19, 1))),
     "42 numbers where other people have 17 x 3": [*alphapose(ROW), *alphapose(ROW[:, :14])],
     "points in 3D": IN_3D,
