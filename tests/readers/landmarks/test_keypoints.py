@@ -15,7 +15,6 @@ from kinefit.readers.guess.files import find_keypoints
 from kinefit.readers.landmarks.keypoint_sets import KEYPOINT_SETS, keypoint_names
 from kinefit.readers.landmarks.keypoints import (
     read_caliscope_csv,
-    read_freemocap,
     read_keypoints,
     read_mediapipe,
     read_openpose,
@@ -504,7 +503,7 @@ def test_freemocap(tmp_path, points):
     assert seen.keypoint_set == ("MEDIAPIPE_33" if points == 33 else "MEDIAPIPE_75")
     assert not seen.confidence[2].any() and (seen.confidence[[0, 1, 3]] == 1.0).all()
     np.testing.assert_array_equal(seen.points[0, 0, :33], data[1, 0, :33, :2])
-    first = read_freemocap(path, rate=30.0)["cam_0"]
+    first = read_keypoints(path, camera="cam_0", rate=30.0)
     if points > 33:
         at = [first.names.index(name) for name in ("left_hand_wrist", "right_hand_wrist")]
         np.testing.assert_array_equal(first.points[0, 0, at], data[0, 0, [54, 33], :2])

@@ -120,12 +120,12 @@ IN_3D = [{"frame_id": 0, "instances": [{"keypoints": [[1.0, 2.0, 3.0]] * 17, "ke
 BAD = {
     "no frame number in the name of the image 'a.jpg'": alphapose(ROW, "a.jpg"),
     "2 frames in 100000001 of frames": [alphapose(ROW)[0], alphapose(ROW)[1] | {"image_id": "100000000.jpg"}],
-    "people of 19 points": alphapose(np.tile(ROW[:, :1], (1, 19, 1))),
-    "42 numbers where other people have 17 x 3": [*alphapose(ROW), *alphapose(ROW[:, :14])],
+    "57 numbers where BODY_25B has 25 x 3": alphapose(np.tile(ROW[:, :1], (1, 19, 1))),
+    "frame 0, person 1: 42 numbers where COCO_17 has 17 x 3": [*alphapose(ROW), *alphapose(ROW[:, :14])],
     "points in 3D": IN_3D,
     "broken json.*keypoints": [{"image_id": "0.jpg", "category_id": 1, "keypoints": [None]}],
     "NaN or infinity": alphapose(ROW * [np.nan, 1.0, 1.0]),
-    "no person is detected in any frame of camera c": [{"frame_id": 0, "instances": []}],
+    "no person is detected in any of the 2 frames of camera c": [{"frame_id": k, "instances": []} for k in (1, 2)],
 }
 
 
@@ -144,7 +144,7 @@ def test_a_set_that_is_stated(tmp_path):
     assert read_keypoints(path, camera="c", rate=30.0, keypoint_set="BODY_25").keypoint_set == "BODY_25"
     with pytest.raises(ObservationError, match="the points are in the order of BODY_25"):
         read_keypoints(path, camera="c", rate=30.0, keypoint_set="BODY_25B")
-    with pytest.raises(ObservationError, match="25 points where HALPE_26 has 26.*This number fits: BODY_25B, BODY_25"):
+    with pytest.raises(ObservationError, match="75 numbers where HALPE_26 has 26.*This number fits: BODY_25B, BODY_25"):
         read_keypoints(path, camera="c", rate=30.0, keypoint_set="HALPE_26")
     with pytest.raises(ObservationError, match="AlphaPose.*not mmpose|MMPose.*not alphapose"):
         read_keypoints(path, format="alphapose", camera="c", rate=30.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
 from os import PathLike
@@ -130,18 +130,30 @@ def read_openpose(
     """
     folder = Path(folder)
     paths, start = cut_frames(_numbered_files(folder), frames, folder)
-    read = [decoded(path, decode_openpose, "openpose") for path in paths]
-    first = next((len(people[0].pose_keypoints_2d) // 3 for people in read if people), 0)
-    named = keypoint_set or SET_OF_COUNT.get(first, "BODY_25B")
-    names = keypoint_names(named)
-    people = [_numbers(persons, path, named) for persons, path in zip(read, paths, strict=True)]
-    if folder.is_dir() and not any(map(len, people)):
+    people = [decoded(path, decode_openpose, "openpose") for path in paths]
+    places = [(path, "") for path in paths]
+    return people_record(people, places, folder, camera, rate, keypoint_set, time_offset, start, image_frame)
+
+
+def people_record(
+    people: Sequence[Sequence[OpenPosePerson]], places: Sequence[tuple[Path, str]], source: Path, camera: str,
+    rate: float, keypoint_set: str | None, time_offset: float = 0.0, start: int = 0,
+    image_frame: ImageFrame | None = None,
+) -> Keypoints:  # fmt: skip
+    """The record of all people of every frame; `places` of the frames are their files and places there, for messages.
+
+    Others as in `read_openpose`, whose errors it raises.
+    """
+    if not any(people) and (source.is_dir() or len(people) != 1):
         raise ObservationError(
-            f"no person is detected in any of the {len(paths)} frames of camera {camera}",
+            f"no person is detected in any of the {len(people)} frames of camera {camera}",
             remedy="Check that the detector ran on this camera's video, or remove this camera.",
         )
-    data = stacked(people, len(names))
-    record = keypoint_record(data, camera, named, rate, time_offset, start, folder, image_frame)
+    first = next((len(persons[0].pose_keypoints_2d) // 3 for persons in people if persons), 0)
+    named = keypoint_set or SET_OF_COUNT.get(first, "BODY_25B")
+    numbers = [_numbers(persons, *place, named) for persons, place in zip(people, places, strict=True)]
+    data = stacked(numbers, len(keypoint_names(named)))
+    record = keypoint_record(data, camera, named, rate, time_offset, start, source, image_frame)
     return in_right_order(record, stated=keypoint_set is not None)
 
 
@@ -258,46 +270,6 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
 
 @checked
 @names_file
-def read_freemocap(path: str | PathLike[str], *, rate: float, face: bool = False) -> dict[str, Keypoints]:
-    """Read the landmarks of all cameras that FreeMoCap recorded: `mediapipe2dData_..._pixelXY.npy`.
-
-    Parameters
-    ----------
-    path : path
-        (C, F, K, 3): x, y [px], and a depth, which is ignored; NaN where undetected. K is 33 (pose), 75 (with the
-        right, then the left hand) or 553 (with the face mesh).
-    rate : float [Hz]
-    face : whether to read the face mesh in place of pose and hands
-
-    Returns
-    -------
-    {"cam_0": Keypoints, ...}
-        In the order of the array; confidence is 1 where detected.
-
-    Raises
-    ------
-    FileError, ObservationError
-        Not an array file; another shape; no landmark in it; no face.
-    """
-    data, pose = read_npy(Path(path), remedy="Process the videos again."), len(KEYPOINT_SETS["MEDIAPIPE_33"])
-    left, end = pose + HAND_POINTS, pose + 2 * HAND_POINTS
-    counts = (end + max(FACE_POINTS),) if face else (pose, end, end + max(FACE_POINTS))
-    if data.dtype.kind != "f" or data.ndim != 4 or data.shape[3] != 3 or data.shape[2] not in counts:
-        remedy = "Give FreeMoCap's array of 2D landmarks, (cameras, frames, 33, 75 or 553, 3); with the face 553."
-        raise ObservationError(f"landmarks have shape {data.shape}", remedy=remedy)
-    order = [*range(end, data.shape[2])] if face else [*range(pose), *range(left, end), *range(pose, left)]
-    chosen = data[:, :, order[: data.shape[2]]]
-    seen = np.isfinite(chosen[..., :2]).all(axis=-1, keepdims=True)
-    whole = np.where(seen, np.concatenate([chosen[..., :2], seen], axis=-1), 0.0)
-    name = FACE_SET if face else MEDIAPIPE_SETS[int(data.shape[2] > pose)]
-    return {
-        f"cam_{k}": keypoint_record(of[:, None], f"cam_{k}", name, rate, 0.0, 0, Path(path), None)
-        for k, of in enumerate(whole)
-    }
-
-
-@checked
-@names_file
 def read_keypoints(
     path: str | PathLike[str], *, format: str | None = None, camera: str, rate: float | None = None,
     time_offset: float = 0.0, image_frame: ImageFrame | None = None, **options: Any,
@@ -358,23 +330,37 @@ def _is_array(dimensions: int, *last: tuple[int, int]) -> Callable[[Path], bool]
     return recognise
 
 
-@names_file
-def _of_number(cameras: Mapping[str, Keypoints], camera: str) -> Keypoints:
-    """The keypoints of the camera that the last number in a name counts."""
+def _of_number(cameras: Mapping[str, _Decoded], camera: str) -> _Decoded:
+    """What a file has of the camera that the last number in a name counts."""
     numbers = re.findall(r"\d+", camera)
-    found = cameras.get(f"cam_{int(numbers[-1][-18:])}" if numbers else "")
-    if found is None:
+    name = f"cam_{int(numbers[-1][-18:])}" if numbers else ""
+    if name not in cameras:
         raise ObservationError(choices("camera in this file named", camera, cameras))
-    return replace(found, camera=camera)
+    return cameras[name]
 
 
+@names_file
 def _caliscope_camera(path: Path, *, camera: str, rate: float | None) -> Keypoints:
-    return _of_number(read_caliscope_csv(path, rate=rate), camera)
+    return replace(_of_number(read_caliscope_csv(path, rate=rate), camera), camera=camera)
 
 
+@names_file
 def _freemocap_camera(path: Path, *, camera: str, rate: float | None, keypoint_set: str | None = None) -> Keypoints:
-    """At 1 Hz without a rate, which the file does not state."""
-    return _of_number(read_freemocap(path, rate=rate or 1.0, face=keypoint_set == FACE_SET), camera)
+    """Pose with the right, then the left hand, and the face mesh: (C, F, K, 3) x, y [px], and a depth, not used.
+
+    NaN where undetected. Without a rate, which the file does not state, at 1 Hz.
+    """
+    data, face = read_npy(path, remedy="Process the videos again."), keypoint_set == FACE_SET
+    pose, left, end = (len(KEYPOINT_SETS["MEDIAPIPE_33"]) + k * HAND_POINTS for k in range(3))
+    if not FREEMOCAP.call("recognise", path, valid=bool, what="") or (face and data.shape[2] <= end):
+        remedy = "Give FreeMoCap's array of 2D landmarks, (cameras, frames, 33, 75 or 553, 3); with the face 553."
+        raise ObservationError(f"landmarks have shape {data.shape}", remedy=remedy)
+    uv = _of_number({f"cam_{k}": of for k, of in enumerate(data[..., :2])}, camera)
+    uv = uv[:, end:] if face else np.concatenate([uv[:, :pose], uv[:, left:end], uv[:, pose:left]], axis=1)
+    seen = np.isfinite(uv).all(axis=-1, keepdims=True)
+    whole = np.where(seen, np.concatenate([uv, seen], axis=-1), 0.0)[:, None]
+    name = FACE_SET if face else MEDIAPIPE_SETS[int(data.shape[2] > pose)]
+    return keypoint_record(whole, camera, name, rate or 1.0, 0.0, 0, path, None)
 
 
 _OTHER_FILES = {  # what such a file has near its start, after spaces: what it is
@@ -449,7 +435,7 @@ def refuse_another(path: Path, format: str | None) -> None:
         raise ObservationError(f"{other}, which are not read", file=path, remedy=_READ)
 
 
-def _numbers(people: list[OpenPosePerson], path: Path, keypoint_set: str) -> NDArray:
+def _numbers(people: Sequence[OpenPosePerson], path: Path, place: str, keypoint_set: str) -> NDArray:
     """(P, K, 3) x, y [px], confidence of all people of one frame."""
     count = len(keypoint_names(keypoint_set))
     values = [p.with_hands() if keypoint_set == OPENPOSE_HANDS else p.pose_keypoints_2d for p in people]
@@ -461,7 +447,7 @@ def _numbers(people: list[OpenPosePerson], path: Path, keypoint_set: str) -> NDA
                 else f"No set has so many; there are: {', '.join(KEYPOINT_SETS)}. Run the detector with one of these."
             )  # fmt: skip
             problem = f"{len(numbers)} numbers where {keypoint_set} has {count} x 3"
-            raise ObservationError(problem, file=path, place=f"person {i}", remedy=remedy)
+            raise ObservationError(problem, file=path, place=f"{place}person {i}", remedy=remedy)
     data = np.array(values, dtype=float).reshape(len(people), count, 3)
     if not np.isfinite(data).all():
         raise ObservationError("numbers too large", file=path, remedy="Run the detector again on this frame.")

@@ -7,27 +7,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import read_bytes
 from kinefit.errors import ObservationError, names_file
 from kinefit.observations import Keypoints
-from kinefit.readers.landmarks.keypoint_sets import (
-    KEYPOINT_SETS,
-    SET_OF_COUNT,
-    frame_numbers,
-    in_right_order,
-    keypoint_names,
-    keypoint_record,
-    stacked,
-)
-from kinefit.readers.landmarks.keypoints import OpenPoseFrame, decoded, with_new_keys
+from kinefit.readers.landmarks.keypoint_sets import frame_numbers
+from kinefit.readers.landmarks.keypoints import OpenPoseFrame, OpenPosePerson, decoded, people_record, with_new_keys
 from kinefit.readers.plugins import FileFormat
 
 Row = tuple[int, list[float]]  # frame, and x, y [px], confidence of each point of one person; none of nobody
-_OF_MORE = {136: "HALPE_26", 68: "HALPE_26"}  # numbers of points that begin with those of a set: with face and hands
+_HALPE, _HALPE_MORE = 3 * 26, (3 * 136, 3 * 68)  # numbers of a person of HALPE_26; with face and hands, with hands
 _VIDEO_IMAGE = re.compile(r"(0|[1-9]\d*)\.\w+")  # name that AlphaPose gives to a frame of a video: "0.jpg"
 _MAX_START_BYTES = 4096  # in which the keys of a form are
 
@@ -65,6 +55,7 @@ def _alphapose(raw: bytes) -> list[Row]:
         people = [(name, person.pose_keypoints_2d) for name, frame in found.items() for person in frame.persons()]
     else:
         people = [(str(one.image_id), one.keypoints) for one in found]
+    people = [(name, numbers[:_HALPE] if len(numbers) in _HALPE_MORE else numbers) for name, numbers in people]
     return list(zip(_frames([name for name, _ in people]), [numbers for _, numbers in people], strict=True))
 
 
@@ -100,35 +91,14 @@ def _reader(format: str, rows_of: Callable[[bytes], list[Row]]) -> Callable[...,
     def read(path: Path, *, camera: str, rate: float, keypoint_set: str | None = None) -> Keypoints:
         """The keypoints of a file, all people in the order of the file; see `read_keypoints`."""
         rows = decoded(path, rows_of, format)
-        if not any(numbers for _, numbers in rows):
-            problem = f"no person is detected in any frame of camera {camera}"
-            raise ObservationError(problem, remedy="Check that the detector ran on this camera's video.")
-        count = next(len(numbers) for _, numbers in rows if numbers) // 3
-        named = keypoint_set or SET_OF_COUNT.get(count) or _OF_MORE.get(count, "")
-        if not named:
-            problem, sets = f"people of {count} points", ", ".join(f"{k} {n}" for k, n in SET_OF_COUNT.items())
-            raise ObservationError(problem, remedy=f"There are sets of {sets}. Run the detector with one of these.")
-        record = keypoint_record(_by_frame(rows, count, named), camera, named, rate, 0.0, 0, path, None)
-        return in_right_order(record, stated=keypoint_set is not None)
+        frames = frame_numbers([frame for frame, _ in rows], "frames")
+        people: list[list[OpenPosePerson]] = [[] for _ in range(frames.max(initial=-1) + 1)]
+        for frame, numbers in rows:
+            people[frame] += [OpenPosePerson(numbers)] if numbers else []
+        places = [(path, f"frame {k}, ") for k in range(len(people))]
+        return people_record(people, places, path, camera, rate, keypoint_set)
 
     return read
-
-
-def _by_frame(rows: Sequence[Row], count: int, keypoint_set: str) -> NDArray:
-    """(F, P, K, 3) x, y [px], confidence."""
-    points = len(keypoint_names(keypoint_set))
-    if _OF_MORE.get(count, "") != keypoint_set and points != count:
-        fitting = [name for name in KEYPOINT_SETS if len(KEYPOINT_SETS[name]) == count]
-        problem = f"{count} points where {keypoint_set} has {points}"
-        raise ObservationError(problem, remedy=f"This number fits: {', '.join(fitting) or 'no set'}.")
-    frames = frame_numbers([frame for frame, _ in rows], "frames").tolist()
-    people: list[list[NDArray]] = [[] for _ in range(max(frames) + 1)]
-    for frame, numbers in rows:
-        if numbers and len(numbers) != 3 * count:
-            problem = f"{len(numbers)} numbers where other people have {count} x 3"
-            raise ObservationError(problem, place=f"frame {frame}", remedy="Run one detector on all frames.")
-        people[frame] += [np.array(numbers).reshape(count, 3)[:points]] if numbers else []
-    return stacked([np.array(persons).reshape(-1, points, 3) for persons in people], points)
 
 
 def _begins(*patterns: bytes) -> Callable[[Path], bool]:
