@@ -414,7 +414,7 @@ def test_openpose_s_own_model_without_a_set(data_dir):
 
 OTHERS = {  # a file that no reader takes: what is said of it
     "annotations.json": (b'{"images": [{"file_name": "a.jpg"}], "annotations": []}', "COCO's annotations"),
-    "tracks.h5": (b"\x89HDF\r\n\x1a\nand nothing more", "HDF5 file that is none of DeepLabCut's or SLEAP's"),
+    "tracks.h5": (b"\x89HDF\r\n\x1a\nand nothing more", "HDF5, of which DeepLabCut's and SLEAP's is read with the package h5py"),
     "table.csv": (b"a,b\n1,2\n", "a file of another kind"),
     "notes.json": (b'{"notes": 3}', "a file of another kind"),
 }
@@ -433,19 +433,21 @@ def test_a_file_that_no_reader_takes_is_said_for_what_it_is(tmp_path, name):
     else:
         (remark,) = find_keypoints([path], [])[1]
         assert remark.startswith(f"{name}: ") and said in remark and "not used" in remark
-        with pytest.raises(ObservationError, match=f"{said}.*which are not read"):
+        with pytest.raises(ObservationError, match=f"{said}.*no keypoints of a known form"):
             read_keypoints(path, format="mediapipe", camera="c", rate=30.0)
 
 
-def test_hdf5_without_the_package_that_reads_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "h5py", None)
+@pytest.mark.parametrize("format", [None, "sleap", "deeplabcut"])
+def test_hdf5_without_the_package_that_reads_it(tmp_path, monkeypatch, format):
+    h5py = pytest.importorskip("h5py")
     path = tmp_path / "a.h5"
-    path.write_bytes(b"\x89HDF\r\n\x1a\n")
-    with pytest.raises(ObservationError, match="read by the package h5py") as caught:
-        read_keypoints(path, camera="c", rate=30.0)
-    assert "kinefit[hdf5]" in caught.value.remedy and caught.value.file == path
-    faults = []
-    assert find_keypoints([path], faults) == ([], []) and "kinefit[hdf5]" in faults[0].remedy
+    with h5py.File(path, "w") as file:
+        file["node_names"] = [1.0]
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(ObservationError, match=r"read with the package h5py \(kinefit\[hdf5\]\)"):
+        read_keypoints(path, format=format, camera="c", rate=30.0)
+    found, (remark,) = find_keypoints([path], [])
+    assert not found and "kinefit[hdf5]" in remark
 
 
 def test_alphapose_s_results_named_as_openpose(data_dir):
@@ -523,7 +525,7 @@ def test_freemocap(tmp_path, points):
 def test_freemocap_s_points_in_space_are_not_read(tmp_path):
     path = tmp_path / "mediapipe3dData_numFrames_numTrackedPoints_spatialXYZ.npy"
     np.save(path, freemocap()[0])
-    with pytest.raises(ObservationError, match="an array of another shape than landmarks in images"):
+    with pytest.raises(ObservationError, match=r"landmarks have shape \(4, 553, 3\)"):
         read_keypoints(path, camera="cam_0", rate=30.0)
     found, (remark,) = find_keypoints([path], [])
     assert not found and "landmarks in images" in remark

@@ -122,7 +122,9 @@ BAD = {
     "2 frames in 100000001 of frames": [alphapose(ROW)[0], alphapose(ROW)[1] | {"image_id": "100000000.jpg"}],
     "57 numbers where BODY_25B has 25 x 3": alphapose(np.tile(ROW[:, :1], (1, 19, 1))),
     "frame 0, person 1: 42 numbers where COCO_17 has 17 x 3": [*alphapose(ROW), *alphapose(ROW[:, :14])],
-    "points in 3D": IN_3D,
+    "broken json.*length 2": IN_3D,
+    "broken json.*17 points and 1 scores": [{"frame_id": 0, "instances": [
+        {"keypoints": [[1.0, 2.0]] * 17, "keypoint_scores": [0.9]}]}],
     "broken json.*keypoints": [{"image_id": "0.jpg", "category_id": 1, "keypoints": [None]}],
     "NaN or infinity": alphapose(ROW * [np.nan, 1.0, 1.0]),
     "no person is detected in any of the 2 frames of camera c": [{"frame_id": k, "instances": []} for k in (1, 2)],

@@ -348,11 +348,8 @@ def find_keypoints(files: list[Path], faults: list[KinefitError]) -> tuple[list[
         elif shape is not None and len(shape) >= 3 and shape[-1] in (2, 3):
             known = "landmarks in images are read as (frames, 33, 3), or (frames, 75, 3) with hands"
             remarks.append(f"{path.name}: an array of shape {shape}; {known}")
-        elif suffix in _MAYBE_KEYPOINTS:
-            try:
-                remarks += [f"{path.name}: {other}; not used"] if (other := other_keypoints(path)) else []
-            except KinefitError as error:
-                faults.append(error)
+        elif suffix in _MAYBE_KEYPOINTS and (other := other_keypoints(path)):
+            remarks.append(f"{path.name}: {other}; not used")
     return found, remarks
 
 

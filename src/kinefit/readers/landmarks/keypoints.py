@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from importlib import import_module
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit._files import npy_header, read_bytes, read_npy, read_table
 from kinefit._mapped import kept
-from kinefit.errors import FileError, ObservationError, choices, extra, names_file
+from kinefit.errors import FileError, ObservationError, choices, names_file
 from kinefit.observations import Keypoints
 from kinefit.observations.arrays import sealed
 from kinefit.observations.clocks import frames_by_name
@@ -72,18 +71,13 @@ class OpenPoseFrame(msgspec.Struct):
 
 
 _PERSON, _FRAME = msgspec.json.Decoder(OpenPosePerson), msgspec.json.Decoder(OpenPoseFrame)
-_OLD_KEYS = {  # of OpenPose before 1.2, and of AlphaPose's form "cmu": today's
-    b'"pose_keypoints"': b'"pose_keypoints_2d"', b'"body_parts"': b'"pose_keypoints_2d"',
-    b'"hand_left_keypoints"': b'"hand_left_keypoints_2d"', b'"hand_right_keypoints"': b'"hand_right_keypoints_2d"',
-    b'"bodies"': b'"people"', b'"joints"': b'"pose_keypoints_2d"',
-}  # fmt: skip
+_OLD_KEY = re.compile(rb'"(pose|hand_left|hand_right)_keypoints"')
 
 
 def with_new_keys(raw: bytes) -> bytes:
-    """JSON of OpenPose's form with the keys that it has today."""
-    for old, new in _OLD_KEYS.items():
-        raw = raw.replace(old, new)
-    return raw
+    """JSON with today's keys in place of those of old versions of OpenPose, and of AlphaPose's form "cmu"."""
+    raw = raw.replace(b'"bodies"', b'"people"').replace(b'"joints"', b'"pose_keypoints_2d"')
+    return _OLD_KEY.sub(rb'"\1_keypoints_2d"', raw)
 
 
 def decode_openpose(raw: bytes) -> list[OpenPosePerson]:
@@ -300,10 +294,6 @@ def read_keypoints(
     """
     path = Path(path)
     format = format or KEYPOINTS.name_of(path)
-    if format is None and path.suffix.lower() != ".npy" and path.is_file():
-        raise ObservationError(
-            f"{other_keypoints(path) or 'a file of another kind'}, no keypoints of a known form", remedy=_READ
-        )
     reader = KEYPOINTS.get(format or "mediapipe", ObservationError)
     if reader.plugin is None and path.is_file():
         refuse_another(path, format)
@@ -365,27 +355,17 @@ def _freemocap_camera(path: Path, *, camera: str, rate: float | None, keypoint_s
 
 _OTHER_FILES = {  # what such a file has near its start, after spaces: what it is
     rb"\{(?=.*\"(?:annotations|categories|file_name)\")": "COCO's annotations of many images",
-    rb"\x89HDF\r\n": "an HDF5 file that is none of DeepLabCut's or SLEAP's",
-    rb"\x93NUMPY": "an array of another shape than landmarks in images have",
+    rb"\x89HDF\r\n": "HDF5, of which DeepLabCut's and SLEAP's is read with the package h5py (kinefit[hdf5])",
 }
 _READ = (
     "Give OpenPose's folder of one json file a frame, or a file of AlphaPose, MMPose, MediaPipe, FreeMoCap (2D), "
-    "Caliscope, DeepLabCut or SLEAP; others by a package (page own-sensor)."
+    "Caliscope, DeepLabCut, SLEAP or Sports2D; others by a package (page own-sensor)."
 )
 
 
 def other_keypoints(path: Path) -> str:
-    """What a file of keypoints that are not read is; "" for any other file.
-
-    Raises
-    ------
-    ObservationError
-        It is HDF5, and the package that reads it is not installed.
-    """
+    """What a file of keypoints that are not read is; "" for any other file."""
     start = read_bytes(path, 4096).lstrip()
-    if start.startswith(b"\x89HDF"):
-        with extra("hdf5", "HDF5 files are read by the package h5py", ObservationError, file=path):
-            import_module("h5py")
     return next((what for pattern, what in _OTHER_FILES.items() if re.match(pattern, start, re.DOTALL)), "")
 
 
@@ -431,8 +411,10 @@ def refuse_another(path: Path, format: str | None) -> None:
     if found not in (None, format):
         problem = f"{KEYPOINTS.get(str(found)).summary}, not {format}"
         raise ObservationError(problem, file=path, remedy=f'Write format = "{found}" in place of "{format}".')
-    if not found and (other := other_keypoints(path)):
-        raise ObservationError(f"{other}, which are not read", file=path, remedy=_READ)
+    strange = format is None and path.suffix.lower() != ".npy"
+    other = "" if found else other_keypoints(path) or "a file of another kind" * strange
+    if other:
+        raise ObservationError(f"{other}: no keypoints of a known form", file=path, remedy=_READ)
 
 
 def _numbers(people: Sequence[OpenPosePerson], path: Path, place: str, keypoint_set: str) -> NDArray:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import read_bytes, read_table
-from kinefit.errors import FileError, ObservationError, extra, names_file
+from kinefit.errors import FileError, ObservationError, check_choice, extra, names_file
 from kinefit.observations import Keypoints
 from kinefit.readers.landmarks.keypoint_sets import KEYPOINT_SETS, frame_numbers, keypoint_record, known_set, stacked
 from kinefit.readers.markers import TRC, is_in_pixels
@@ -40,12 +40,10 @@ def _reader(table: Callable[[Path], Table]) -> Callable[..., Keypoints]:
         data = np.where(np.isfinite(data).all(axis=-1, keepdims=True), data, 0.0)
         if not data.any():
             raise ObservationError(f"no point of camera {camera} is seen in any of {len(data)} frames", remedy=_AGAIN)
-        renamed = {**dict.fromkeys(own, None), **(names or {})}
-        if strange := [name for name in renamed if name not in own]:
-            problem, remedy = f"names = {{ {strange[0]} = ... }} is of no point", f"There are: {', '.join(own)}."
-            raise ObservationError(problem, remedy=remedy)
-        kept = [k for k, name in enumerate(own) if renamed[name] != ""]
-        chosen = [renamed[own[k]] or own[k] for k in kept]
+        for name in names or ():
+            check_choice("point in this file named", name, own, ObservationError)
+        renamed = [(names or {}).get(name, name) for name in own]
+        kept, chosen = [k for k, name in enumerate(renamed) if name], [name for name in renamed if name]
         if keypoint_set is not None and keypoint_set not in KEYPOINT_SETS:
             return keypoint_record(data[:, :, kept], camera, keypoint_set, rate, 0.0, 0, path, None, chosen)
         keypoint_set, at = known_set(chosen, keypoint_set, path)

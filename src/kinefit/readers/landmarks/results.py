@@ -32,8 +32,17 @@ class _Person(msgspec.Struct):
 class _Instance(msgspec.Struct):
     """A person of MMPose."""
 
-    keypoints: list[list[float]]
+    keypoints: list[tuple[float, float]]
     keypoint_scores: list[float]
+
+    def __post_init__(self) -> None:
+        if len(self.keypoints) != len(self.keypoint_scores):
+            raise ValueError(f"{len(self.keypoints)} points and {len(self.keypoint_scores)} scores")
+
+    @property
+    def numbers(self) -> list[float]:
+        """x, y [px], score of each point."""
+        return [v for point, score in zip(self.keypoints, self.keypoint_scores) for v in (*point, score)]
 
 
 class _Instances(msgspec.Struct):
@@ -72,17 +81,8 @@ def _frames(names: Sequence[str]) -> list[int]:
 def _mmpose(raw: bytes) -> list[Row]:
     found = _MMPOSE.decode(raw)
     frames = found if isinstance(found, list) else found.instance_info
-    first, rows = min((frame.frame_id for frame in frames), default=0), list[Row]()  # all frames are in the file
-    for frame in frames:
-        rows.append((frame.frame_id - first, []))
-        for one in frame.instances:
-            if len(one.keypoints) != len(one.keypoint_scores) or any(len(point) != 2 for point in one.keypoints):
-                problem = f"{len(one.keypoints)} points and {len(one.keypoint_scores)} scores, or points in 3D"
-                remedy = "Save the predictions of a network of 2D keypoints."
-                raise ObservationError(problem, place=f"frame {frame.frame_id}", remedy=remedy)
-            numbers = [v for point, score in zip(one.keypoints, one.keypoint_scores) for v in (*point, score)]
-            rows.append((frame.frame_id - first, numbers))
-    return rows
+    first = min((frame.frame_id for frame in frames), default=0)  # 0 or 1: all frames are in the file
+    return [(f.frame_id - first, row) for f in frames for row in [one.numbers for one in f.instances] or [[]]]
 
 
 def _reader(format: str, rows_of: Callable[[bytes], list[Row]]) -> Callable[..., Keypoints]:
