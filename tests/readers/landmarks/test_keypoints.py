@@ -414,7 +414,7 @@ def test_openpose_s_own_model_without_a_set(data_dir):
 
 OTHERS = {  # a file that no reader takes: what is said of it
     "annotations.json": (b'{"images": [{"file_name": "a.jpg"}], "annotations": []}', "COCO's annotations"),
-    "tracks.h5": (b"\x89HDF\r\n\x1a\nand nothing more", "HDF5, of which DeepLabCut's and SLEAP's is read with the package h5py"),
+    "tracks.h5": (b"\x89HDF\r\n\x1a\nand nothing more", "HDF5, of which DeepLabCut's and SLEAP's is read"),
     "table.csv": (b"a,b\n1,2\n", "a file of another kind"),
     "notes.json": (b'{"notes": 3}', "a file of another kind"),
 }

@@ -23,7 +23,7 @@ from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, SUFFI
 from kinefit.readers.depth.images import PICTURES, natural, npy_source, picture_source
 from kinefit.readers.depth.streams import has_depth_track
 from kinefit.readers.guess.names import camera_of
-from kinefit.readers.landmarks.keypoints import decode_openpose, other_keypoints, read_keypoints
+from kinefit.readers.landmarks.keypoints import FRAME_NUMBER, decode_openpose, other_keypoints, read_keypoints
 from kinefit.readers.plugins import CALIBRATIONS, KEYPOINTS, MARKERS
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.videos.video import ENDINGS, ImageFolder, Video
@@ -42,7 +42,6 @@ DRAWN_ON = re.compile(r"(?<![a-z])(?:pose|overlay|labell?ed|annotated|results?|d
 _RESULT_ENDINGS = ("-kinefit", "-detect")  # of the folders that kinefit writes
 _MAX_DEPTH = 6  # folders below the given one
 _MIN_SEQUENCE = 12  # numbered json files in one folder are a detector's frames, fewer may be cameras
-_JSON_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.I)
 _MAYBE_KEYPOINTS = (".json", ".csv", ".h5")
 _CALISCOPE_COLUMNS = ("sync_index", "port", "point_id", "img_loc_x", "img_loc_y")
 _CALIBRATION_NAME = re.compile(r"calib|intrin|extrin|cam", re.IGNORECASE)  # else a broken file may be anything
@@ -158,7 +157,7 @@ def find_calibrations(
 
 
 def _numbered(path: Path) -> bool:
-    return bool(_JSON_NUMBER.search(path.name))
+    return bool(FRAME_NUMBER.search(path.name))
 
 
 def _by_folder(files: list[Path]) -> list[tuple[Path, list[Path]]]:

@@ -44,7 +44,8 @@ if TYPE_CHECKING:
 
 _Decoded = TypeVar("_Decoded")
 _MISSING_HAND = [0.0] * (3 * HAND_POINTS)
-_FRAME_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.IGNORECASE)
+FRAME_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.IGNORECASE)
+"""At the end of the name of a file of one frame."""
 
 
 class OpenPosePerson(msgspec.Struct):
@@ -139,16 +140,19 @@ def people_record(
     Others as in `read_openpose`, whose errors it raises.
     """
     if not any(people) and (source.is_dir() or len(people) != 1):
-        raise ObservationError(
-            f"no person is detected in any of the {len(people)} frames of camera {camera}",
-            remedy="Check that the detector ran on this camera's video, or remove this camera.",
-        )
+        raise _nobody(len(people), camera)
     first = next((len(persons[0].pose_keypoints_2d) // 3 for persons in people if persons), 0)
     named = keypoint_set or SET_OF_COUNT.get(first, "BODY_25B")
     numbers = [_numbers(persons, *place, named) for persons, place in zip(people, places, strict=True)]
     data = stacked(numbers, len(keypoint_names(named)))
     record = keypoint_record(data, camera, named, rate, time_offset, start, source, image_frame)
     return in_right_order(record, stated=keypoint_set is not None)
+
+
+def _nobody(frames: int, camera: str) -> ObservationError:
+    problem = f"no person is detected in any of the {frames} frames of camera {camera}"
+    remedy = "Check that the detector ran on this camera's video, or remove this camera."
+    return ObservationError(problem, remedy=remedy)
 
 
 @checked
@@ -197,10 +201,7 @@ def read_mediapipe(
     if keypoint_set == "MEDIAPIPE_478":
         data = face_mesh(data)
     if not data[..., 2].any():
-        raise ObservationError(
-            f"no person is detected in any of the {len(data)} frames of camera {camera}",
-            remedy="Check that the detector ran on this camera's video, or remove this camera.",
-        )
+        raise _nobody(len(data), camera)
     return keypoint_record(data[:, None], camera, keypoint_set, rate, time_offset, start, path, image_frame)
 
 
@@ -309,15 +310,11 @@ def _is_caliscope(path: Path) -> bool:
     return path.suffix.lower() == ".csv" and b"sync_index" in read_bytes(path, 4096)
 
 
-def _is_array(dimensions: int, *last: tuple[int, int]) -> Callable[[Path], bool]:
+def _is_array(path: Path, dimensions: int, *last: tuple[int, int]) -> bool:
     """Whether a file is an array of numbers with as many dimensions, of which the last two are one of these."""
-
-    def recognise(path: Path) -> bool:
-        header = npy_header(path) if path.suffix.lower() == ".npy" else None
-        shape = header[0] if header is not None and header[1].kind in "fiu" else ()
-        return len(shape) == dimensions and shape[-2:] in last
-
-    return recognise
+    header = npy_header(path) if path.suffix.lower() == ".npy" else None
+    shape = header[0] if header is not None and header[1].kind in "fiu" else ()
+    return len(shape) == dimensions and shape[-2:] in last
 
 
 def _of_number(cameras: Mapping[str, _Decoded], camera: str) -> _Decoded:
@@ -381,7 +378,7 @@ def _numbered_files(folder: Path) -> list[Path]:
         remedy = "Name the folder that the detector wrote for this camera."
         raise FileError("there are no json files in this folder", remedy=remedy)
     for path in files:
-        if not _FRAME_NUMBER.search(path.name):
+        if not FRAME_NUMBER.search(path.name):
             refuse_another(path, "openpose")
             raise ObservationError("no frame number in this name", file=path, remedy="Expected NAME_0012.json.")
     numbered = frames_by_name([path.name.lower().replace("_keypoints", "") for path in files], "frames")
@@ -438,11 +435,12 @@ def _numbers(people: Sequence[OpenPosePerson], path: Path, place: str, keypoint_
 
 OPENPOSE = FileFormat("OpenPose (Cao et al. 2021, IEEE TPAMI 43:172)", (), read_openpose, Path.is_dir)
 MEDIAPIPE = FileFormat(
-    "MediaPipe Pose (Bazarevsky et al. 2020, BlazePose)", (".npy",), read_mediapipe, _is_array(3, (33, 3), (75, 3))
+    "MediaPipe Pose (Bazarevsky et al. 2020, BlazePose)", (".npy",), read_mediapipe,
+    lambda path: _is_array(path, 3, (33, 3), (75, 3)),
 )
 FREEMOCAP = FileFormat(
     "the landmarks in all images of FreeMoCap", (".npy",), _freemocap_camera,
-    _is_array(4, (33, 3), (75, 3), (553, 3)), has_all_cameras=True,
+    lambda path: _is_array(path, 4, (33, 3), (75, 3), (553, 3)), has_all_cameras=True,
 )
 CALISCOPE = FileFormat(
     "the landmarks that Caliscope recorded", (".csv",), _caliscope_camera, _is_caliscope, has_all_cameras=True

@@ -8,6 +8,7 @@ import pickle
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -28,30 +29,27 @@ _MAX_BYTES = 2**32  # of an array, which a damaged file may declare to be larger
 _AGAIN = "Export it again."
 
 
-def _reader(table: Callable[[Path], Table]) -> Callable[..., Keypoints]:
-    @checked
-    @names_file
-    def read(
-        path: Path, *, camera: str, rate: float, keypoint_set: str | None = None,
-        names: Mapping[str, str] | None = None,
-    ) -> Keypoints:  # fmt: skip
-        """The keypoints of a file, as points of a known set or of one of the user's own; see `read_keypoints`."""
-        own, data = table(path)
-        data = np.where(np.isfinite(data).all(axis=-1, keepdims=True), data, 0.0)
-        if not data.any():
-            raise ObservationError(f"no point of camera {camera} is seen in any of {len(data)} frames", remedy=_AGAIN)
-        for name in names or ():
-            check_choice("point in this file named", name, own, ObservationError)
-        renamed = [(names or {}).get(name, name) for name in own]
-        kept, chosen = [k for k, name in enumerate(renamed) if name], [name for name in renamed if name]
-        if keypoint_set is not None and keypoint_set not in KEYPOINT_SETS:
-            return keypoint_record(data[:, :, kept], camera, keypoint_set, rate, 0.0, 0, path, None, chosen)
-        keypoint_set, at = known_set(chosen, keypoint_set, path)
-        whole = np.zeros((*data.shape[:2], len(KEYPOINT_SETS[keypoint_set]), 3))
-        whole[:, :, at] = data[:, :, kept]
-        return keypoint_record(whole, camera, keypoint_set, rate, 0.0, 0, path, None)
-
-    return read
+@checked
+@names_file
+def _read(
+    path: Path, *, table: Callable[[Path], Table], camera: str, rate: float, keypoint_set: str | None = None,
+    names: Mapping[str, str] | None = None,
+) -> Keypoints:  # fmt: skip
+    """The keypoints of a file, as points of a known set or of one of the user's own; see `read_keypoints`."""
+    own, data = table(path)
+    data = np.where(np.isfinite(data).all(axis=-1, keepdims=True), data, 0.0)
+    if not data.any():
+        raise ObservationError(f"no point of camera {camera} is seen in any of {len(data)} frames", remedy=_AGAIN)
+    for name in names or ():
+        check_choice("point in this file named", name, own, ObservationError)
+    renamed = [(names or {}).get(name, name) for name in own]
+    kept, chosen = [k for k, name in enumerate(renamed) if name], [name for name in renamed if name]
+    if keypoint_set is not None and keypoint_set not in KEYPOINT_SETS:
+        return keypoint_record(data[:, :, kept], camera, keypoint_set, rate, 0.0, 0, path, None, chosen)
+    keypoint_set, at = known_set(chosen, keypoint_set, path)
+    whole = np.zeros((*data.shape[:2], len(KEYPOINT_SETS[keypoint_set]), 3))
+    whole[:, :, at] = data[:, :, kept]
+    return keypoint_record(whole, camera, keypoint_set, rate, 0.0, 0, path, None)
 
 
 def _of_columns(columns: Sequence[Sequence[str]], frames: NDArray, values: NDArray) -> Table:
@@ -157,30 +155,26 @@ def _whole(dataset: Any) -> NDArray:
     return dataset[:]
 
 
-def _holds(text: bytes, name: str) -> Callable[[Path], bool]:
+def _holds(path: Path, text: bytes, name: str) -> bool:
     """Whether a table begins with a pattern, or an HDF5 file has something of a name in it or in a group of it."""
-    pattern = re.compile(text)
-
-    def recognise(path: Path) -> bool:
-        if not _is_hdf5(path):
-            return path.suffix.lower() == ".csv" and bool(pattern.match(read_bytes(path, 2**16)))
-        try:
-            with _hdf5(path) as file:
-                return name in file or any(name in group.attrs for group in file.values())
-        except (FileError, ObservationError):
-            return False
-
-    return recognise
+    if not _is_hdf5(path):
+        return path.suffix.lower() == ".csv" and bool(re.match(text, read_bytes(path, 2**16)))
+    try:
+        with _hdf5(path) as file:
+            return name in file or any(name in group.attrs for group in file.values())
+    except (FileError, ObservationError):
+        return False
 
 
 DEEPLABCUT = FileFormat(
-    "points of DeepLabCut (Mathis et al. 2018, Nature Neuroscience 21:1281)", (".csv", ".h5"), _reader(_deeplabcut),
-    _holds(rb"(?:\xef\xbb\xbf)?scorer,.*\r?\n(?:bodyparts|individuals),", "non_index_axes"),
+    "points of DeepLabCut (Mathis et al. 2018, Nature Neuroscience 21:1281)", (".csv", ".h5"),
+    partial(_read, table=_deeplabcut),
+    lambda path: _holds(path, rb"(?:\xef\xbb\xbf)?scorer,.*\r?\n(?:bodyparts|individuals),", "non_index_axes"),
 )
 SLEAP = FileFormat(
-    "points of SLEAP (Pereira et al. 2022, Nature Methods 19:486)", (".csv", ".h5"), _reader(_sleap),
-    _holds(rb"(?:\xef\xbb\xbf)?(?=[^\n]*\bframe_idx\b)(?=[^\n]*\binstance\.score\b)[^\n]*\.x,", "node_names"),
+    "points of SLEAP (Pereira et al. 2022, Nature Methods 19:486)", (".csv", ".h5"), partial(_read, table=_sleap),
+    lambda path: _holds(path, rb"(?=[^\n]*\bframe_idx\b)(?=[^\n]*\binstance\.score\b)[^\n]*\.x,", "node_names"),
 )
 SPORTS2D = FileFormat(
-    "points in pixels of Sports2D (Pagnon 2024, JOSS 9:6849)", (".trc",), _reader(_sports2d), is_in_pixels
+    "points in pixels of Sports2D (Pagnon 2024, JOSS 9:6849)", (".trc",), partial(_read, table=_sports2d), is_in_pixels
 )

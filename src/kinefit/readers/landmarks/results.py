@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -85,34 +86,36 @@ def _mmpose(raw: bytes) -> list[Row]:
     return [(f.frame_id - first, row) for f in frames for row in [one.numbers for one in f.instances] or [[]]]
 
 
-def _reader(format: str, rows_of: Callable[[bytes], list[Row]]) -> Callable[..., Keypoints]:
-    @checked
-    @names_file
-    def read(path: Path, *, camera: str, rate: float, keypoint_set: str | None = None) -> Keypoints:
-        """The keypoints of a file, all people in the order of the file; see `read_keypoints`."""
-        rows = decoded(path, rows_of, format)
-        frames = frame_numbers([frame for frame, _ in rows], "frames")
-        people: list[list[OpenPosePerson]] = [[] for _ in range(frames.max(initial=-1) + 1)]
-        for frame, numbers in rows:
-            people[frame] += [OpenPosePerson(numbers)] if numbers else []
-        places = [(path, f"frame {k}, ") for k in range(len(people))]
-        return people_record(people, places, path, camera, rate, keypoint_set)
+@checked
+@names_file
+def _read(
+    path: Path, *, format: str, rows_of: Callable[[bytes], list[Row]], camera: str, rate: float,
+    keypoint_set: str | None = None,
+) -> Keypoints:  # fmt: skip
+    """The keypoints of a file, all people in the order of the file; see `read_keypoints`."""
+    rows = decoded(path, rows_of, format)
+    frames = frame_numbers([frame for frame, _ in rows], "frames")
+    people: list[list[OpenPosePerson]] = [[] for _ in range(frames.max(initial=-1) + 1)]
+    for frame, numbers in rows:
+        people[frame] += [OpenPosePerson(numbers)] if numbers else []
+    places = [(path, f"frame {k}, ") for k in range(len(people))]
+    return people_record(people, places, path, camera, rate, keypoint_set)
 
-    return read
 
-
-def _begins(*patterns: bytes) -> Callable[[Path], bool]:
+def _begins(path: Path, *patterns: bytes) -> bool:
     """Whether the start of a file has one of these patterns, after spaces."""
-    known = re.compile(rb"\s*(?:" + b"|".join(patterns) + b")", re.DOTALL)
-    return lambda path: path.is_file() and bool(known.match(read_bytes(path, _MAX_START_BYTES)))
+    start = read_bytes(path, _MAX_START_BYTES).lstrip() if path.is_file() else b""
+    return any(re.match(pattern, start, re.DOTALL) for pattern in patterns)
 
 
 ALPHAPOSE = FileFormat(
     "all frames' people by AlphaPose (Fang et al. 2022, IEEE TPAMI 45:7157), or COCO's results", (".json",),
-    _reader("alphapose", _alphapose),
-    _begins(rb'\[\s*\{(?=.*"image_id")(?=.*"keypoints")', rb'\{\s*"[^"]*\.(?i:jpe?g|png|bmp|tiff?)"\s*:'),
+    partial(_read, format="alphapose", rows_of=_alphapose),
+    lambda path: _begins(
+        path, rb'\[\s*\{(?=.*"image_id")(?=.*"keypoints")', rb'\{\s*"[^"]*\.(?i:jpe?g|png|bmp|tiff?)"\s*:'
+    ),
 )
 MMPOSE = FileFormat(
-    "all frames' people by MMPose (OpenMMLab 2020)", (".json",), _reader("mmpose", _mmpose),
-    _begins(rb'\[\s*\{\s*"frame_id"\s*:', rb'\{\s*"(?:meta_info|instance_info)"\s*:'),
+    "all frames' people by MMPose (OpenMMLab 2020)", (".json",), partial(_read, format="mmpose", rows_of=_mmpose),
+    lambda path: _begins(path, rb'\[\s*\{\s*"frame_id"\s*:', rb'\{\s*"(?:meta_info|instance_info)"\s*:'),
 )
