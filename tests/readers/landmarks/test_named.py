@@ -175,6 +175,12 @@ def test_nothing_seen_and_a_depth_in_place_of_a_likelihood(tmp_path):
         read_keypoints(deeplabcut_csv(tmp_path / "a.csv", data), camera="c", rate=25.0)
 
 
+def test_as_many_names_as_points(tmp_path):
+    path = sleap_h5(tmp_path / "a.h5", points(), ("nose", "left_knee"))
+    with pytest.raises(FileError, match="2 names of 3 points"):
+        read_keypoints(path, camera="c", rate=25.0)
+
+
 @pytest.mark.parametrize("form", ["deeplabcut h5", "sleap h5"])
 def test_damaged_hdf5_is_refused(tmp_path, form):
     name, write = FORMS[form]

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from kinefit.geometry.camera import ImageFrame
 
 _Decoded = TypeVar("_Decoded")
+_FREEMOCAP = (33, 3), (75, 3), (553, 3)  # last dimensions of its arrays: points, and x, y, z
 _MISSING_HAND = [0.0] * (3 * HAND_POINTS)
 FRAME_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.IGNORECASE)
 """At the end of the name of a file of one frame."""
@@ -339,7 +340,7 @@ def _freemocap_camera(path: Path, *, camera: str, rate: float | None, keypoint_s
     """
     data, face = read_npy(path, remedy="Process the videos again."), keypoint_set == FACE_SET
     pose, left, end = (len(KEYPOINT_SETS["MEDIAPIPE_33"]) + k * HAND_POINTS for k in range(3))
-    if not FREEMOCAP.call("recognise", path, valid=bool, what="") or (face and data.shape[2] <= end):
+    if not _is_array(path, 4, *_FREEMOCAP) or (face and data.shape[2] <= end):
         remedy = "Give FreeMoCap's array of 2D landmarks, (cameras, frames, 33, 75 or 553, 3); with the face 553."
         raise ObservationError(f"landmarks have shape {data.shape}", remedy=remedy)
     uv = _of_number({f"cam_{k}": of for k, of in enumerate(data[..., :2])}, camera)
@@ -440,7 +441,7 @@ MEDIAPIPE = FileFormat(
 )
 FREEMOCAP = FileFormat(
     "the landmarks in all images of FreeMoCap", (".npy",), _freemocap_camera,
-    lambda path: _is_array(path, 4, (33, 3), (75, 3), (553, 3)), has_all_cameras=True,
+    lambda path: _is_array(path, 4, *_FREEMOCAP), has_all_cameras=True,
 )
 CALISCOPE = FileFormat(
     "the landmarks that Caliscope recorded", (".csv",), _caliscope_camera, _is_caliscope, has_all_cameras=True

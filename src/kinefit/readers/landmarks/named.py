@@ -37,6 +37,8 @@ def _read(
 ) -> Keypoints:  # fmt: skip
     """The keypoints of a file, as points of a known set or of one of the user's own; see `read_keypoints`."""
     own, data = table(path)
+    if data.shape[2] != len(own):
+        raise FileError(f"{len(own)} names of {data.shape[2]} points", remedy=_AGAIN)
     data = np.where(np.isfinite(data).all(axis=-1, keepdims=True), data, 0.0)
     if not data.any():
         raise ObservationError(f"no point of camera {camera} is seen in any of {len(data)} frames", remedy=_AGAIN)
@@ -72,11 +74,11 @@ def _of_columns(columns: Sequence[Sequence[str]], frames: NDArray, values: NDArr
 def _deeplabcut(path: Path) -> Table:
     if _is_hdf5(path):
         return _deeplabcut_hdf5(path)
-    rows = list(csv.reader(io.StringIO(read_bytes(path).decode("utf-8-sig", "replace"))))
-    heads = [row for row in rows[:4] if row and row[0] in ("scorer", "individuals", "bodyparts", "coords")]
     try:
+        rows = list(csv.reader(io.StringIO(read_bytes(path).decode("utf-8-sig", "replace"))))
+        heads = [row for row in rows[:4] if row and row[0] in ("scorer", "individuals", "bodyparts", "coords")]
         numbers = np.array([[float(cell or "nan") for cell in row] for row in rows[len(heads) :] if row])
-    except ValueError as error:
+    except (ValueError, csv.Error) as error:
         raise FileError(f"a cell is not a number ({error})", remedy=_AGAIN) from error
     if numbers.ndim != 2 or {len(row) for row in heads} != {numbers.shape[1]} or heads[-1][0] != "coords":
         raise FileError("rows of different lengths, or none", remedy=_AGAIN)
@@ -112,8 +114,8 @@ def _sleap(path: Path) -> Table:
 
 def _sleap_csv(path: Path) -> Table:
     """SLEAP's table of a row for each person in each frame."""
-    head = next(csv.reader(io.StringIO(read_bytes(path, 2**20).decode("utf-8-sig", "replace"))), [])
-    names = [cell.removesuffix(".x") for cell in head if cell.endswith(".x")]
+    head = read_bytes(path, 2**20).partition(b"\n")[0].decode("utf-8-sig", "replace").split(",")
+    names = [cell.strip().removesuffix(".x") for cell in head if cell.strip().endswith(".x")]
     columns = [f"{name}.{axis}" for name in names for axis in ("x", "y", "score")]
     table = read_table(path, ["frame_idx"], _AGAIN, optional=columns)[1]
     frames = frame_numbers(table[:, 0], "frame_idx")
