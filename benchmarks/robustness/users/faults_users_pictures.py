@@ -179,31 +179,33 @@ def _human36m(folder: Path) -> bool:
 def _alphapose(folder: Path) -> bool:
     with copied(folder) as case:
         path = write_video(case / "cam1.mp4", range(20)).parent / "alphapose-results.json"
-        return _is_said(path, "AlphaPose")
+        return _is_read(path, "AlphaPose", 'format = "alphapose"')
 
 
-def _is_said(path: Path, program: str) -> bool:
-    """Whether the reader and `init` say what another program's file is, and how to split it."""
+def _is_read(path: Path, program: str, remedy: str) -> bool:
+    """Whether a file is read, told where it is taken for OpenPose's, and named by `init` without a calibration."""
     status, told = run("init", path.parent)
+    seen = read_keypoints(path, camera="c", rate=30.0)
     try:
         read_keypoints(path, format="openpose", camera="c", rate=30.0)
     except ObservationError as error:
-        said = program in error.problem and "pose_keypoints_2d" in (error.remedy or "")
-        return said and status == 0 and f"{path.name}: " in told and program in told and "not used" in told
+        said = program in error.problem and remedy in (error.remedy or "")
+        named = status == 0 and f"{path.name}: not used" in told
+        return said and named and seen.keypoint_set == "COCO_17" and bool(seen.confidence.any())
     return False
 
 
 def _coco(folder: Path) -> bool:
     path = write_video(folder / "cam1.mp4", range(20)).with_name("person_keypoints.json")
     path.write_text(json.dumps([{"image_id": i, "category_id": 1, "keypoints": [5.0, 6.0, 2] * 17} for i in range(9)]))
-    return _is_said(path, "COCO")
+    return _is_read(path, "COCO", 'format = "alphapose"')
 
 
 def _deeplabcut(folder: Path) -> bool:
     path = write_video(folder / "cam1.mp4", range(20)).with_name("cam1DLC_resnet50.csv")
     path.write_text("scorer,net,net,net\nbodyparts,nose,nose,nose\ncoords,x,y,likelihood\n0,1.0,2.0,0.9\n")
-    with_folder = run("init", folder)[1]
-    return "DeepLabCut" in with_folder and "not used" in with_folder
+    seen = read_keypoints(path, camera="c", rate=30.0)
+    return seen.points[0, 0, 0].tolist() == [1.0, 2.0] and f"{path.name}: not used" in run("init", folder)[1]
 
 
 # ---- several people

@@ -316,8 +316,14 @@ class FileFormats(Extensions[FileFormat]):
 
 KEYPOINTS = FileFormats("kinefit.readers", FileFormat, "keypoint format", {
     "openpose": "kinefit.readers.landmarks.keypoints:OPENPOSE",
+    "alphapose": "kinefit.readers.landmarks.results:ALPHAPOSE",
+    "mmpose": "kinefit.readers.landmarks.results:MMPOSE",
     "mediapipe": "kinefit.readers.landmarks.keypoints:MEDIAPIPE",
+    "deeplabcut": "kinefit.readers.landmarks.named:DEEPLABCUT",
+    "sleap": "kinefit.readers.landmarks.named:SLEAP",
+    "freemocap": "kinefit.readers.landmarks.keypoints:FREEMOCAP",
     "caliscope": "kinefit.readers.landmarks.keypoints:CALISCOPE",
+    "sports2d": "kinefit.readers.landmarks.named:SPORTS2D",
 }, _KINDS_OF_FILES[0])  # fmt: skip
 """Formats of keypoints, which take files name; the most informative confidence first."""
 

@@ -199,7 +199,9 @@ def _choose_calibration(
             remedy=f"{fault.remedy or ''} {_CALIBRATE}".strip(),
         )
     if not found:
-        if videos and not keypoints:
+        if videos and (not keypoints or len(videos) == 1):
+            for path in keypoints:
+                draft.note("keypoints", "open", f"{draft.name(path)}: not used without a calibration of its camera")
             if singles:
                 draft.note("calibration", "open", f"{draft.name(singles[0])} has one camera only: not used")
             describe_uncalibrated(draft, _of_one_moment(draft, videos))

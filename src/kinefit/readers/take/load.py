@@ -310,7 +310,9 @@ def _read_keypoints(
         frame = rigs.stated_frame(image, source.frame, "keypoints")
         rate = rigs.stated_rate(source.rate or rates.get(f"video {source.camera}") or take.rate)
     assert source.file is not None
-    options: dict[str, Any] = {"keypoint_set": source.set} if source.format == "openpose" and source.set else {}
+    takes_set = source.set and source.format in (*entries.COUNTED, *entries.NAMED, "freemocap")
+    options: dict[str, Any] = {"keypoint_set": source.set} if takes_set else {}
+    options |= {"names": source.names} if source.names else {}
     record = read_keypoints(
         source.file, format=source.format, camera=source.camera, rate=rate, image_frame=frame, time_offset=offset,
         **options,
