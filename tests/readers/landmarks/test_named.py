@@ -197,7 +197,7 @@ def test_code_in_the_names_of_a_table_is_not_run(tmp_path):
     with h5py.File(path, "a") as file:
         evil = b"cbuiltins\nopen\n(V" + str(tmp_path / "made").encode() + b"\nVw\ntR."
         file["df_with_missing"].attrs["non_index_axes"] = np.bytes_(evil)
-    with pytest.raises(FileError, match=r"another form .*builtins\.open"):
+    with pytest.raises(FileError, match=r"another form"):
         read_keypoints(path, camera="c", rate=25.0)
     assert not (tmp_path / "made").exists()
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-import pickle
+import pickletools
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,19 +85,32 @@ def _deeplabcut(path: Path) -> Table:
     return _of_columns(list(zip(*(row[1:] for row in heads), strict=True)), numbers[:, 0], numbers[:, 1:])
 
 
-class _Texts(pickle.Unpickler):
-    """Reads lists and tuples of texts and numbers, no class or function."""
-
-    def find_class(self, module: str, name: str) -> NoReturn:
-        raise pickle.UnpicklingError(f"{module}.{name}")
+def _pickled_texts(raw: bytes) -> list[str]:
+    """The texts of pickled lists of texts, in their order; the bytes are read, not run."""
+    texts: list[str] = []
+    memo: dict[int, str | None] = {}
+    text = None
+    for operation, argument, _ in pickletools.genops(raw):
+        name = operation.name
+        if "UNICODE" in name:
+            text = argument
+            texts.append(argument)
+        elif "GET" in name:
+            text = memo[argument]
+            texts += [text] if text is not None else []
+        elif "PUT" in name or name == "MEMOIZE":
+            memo[len(memo) if argument is None else argument] = text
+        else:
+            text = None
+    return texts
 
 
 def _deeplabcut_hdf5(path: Path) -> Table:
     """The table of pandas that DeepLabCut writes (`df_with_missing`, format "table")."""
     with _hdf5(path) as file:
         group = next(group for group in file.values() if "table" in group)
-        ((_, columns),) = _Texts(io.BytesIO(bytes(group.attrs["non_index_axes"]))).load()
-        table = _whole(group["table"])
+        table, texts = _whole(group["table"]), _pickled_texts(bytes(group.attrs["non_index_axes"]))
+        columns = np.reshape(texts, (table["values_block_0"].shape[1], -1)).tolist()
         return _of_columns(columns, table["index"].astype(float), table["values_block_0"])
 
 
@@ -147,7 +160,7 @@ def _hdf5(path: Path) -> Iterator[Any]:
         with h5py.File(path, "r") as file:
             yield file
     except (OSError, KeyError, ValueError, TypeError, RuntimeError, StopIteration, AttributeError,
-            pickle.UnpicklingError, EOFError, IndexError) as error:  # fmt: skip
+            EOFError, IndexError) as error:  # fmt: skip
         raise FileError(f"damaged, or of another form ({error})", remedy=_AGAIN) from error
 
 
