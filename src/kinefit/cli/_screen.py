@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,6 +80,32 @@ def _remember(key: str) -> Callable[[click.Context, click.Parameter, bool], bool
     return remember
 
 
+def options_record(
+    name: str, build: Callable[..., Any], *options: Callable[[Callable], Callable]
+) -> Callable[[Callable], Callable]:
+    """Add options to a command; it gets what `build` makes of their values, in one parameter of this name."""
+
+    def add(command: Callable) -> Callable:
+        @wraps(command)
+        def called(*args: Any, **given: Any) -> Any:
+            values = {key: given.pop(key) for key in keys}
+            return command(*args, **given, **{name: build(**values)})
+
+        before = len(getattr(called, "__click_params__", ()))
+        for option in reversed(options):
+            called = option(called)
+        keys = [parameter.name for parameter in getattr(called, "__click_params__", ())[before:]]
+        return called
+
+    return add
+
+
+def is_stated(name: str) -> bool:
+    """Whether the command that runs was given this option in so many words."""
+    source = click.get_current_context().get_parameter_source(name)
+    return source is click.core.ParameterSource.COMMANDLINE
+
+
 def verbose_option(command: Callable) -> Callable:
     """Add `-v` to a command, which asks `is_verbose` for it."""
     text = "Show details: residuals of every point in every camera, and the traceback of an error."
@@ -123,12 +150,6 @@ def _emit(event: str, **content: Any) -> None:
     import json
 
     print(json.dumps({"event": event, **content}, ensure_ascii=False), file=sys.stderr, flush=True)
-
-
-def token_option(command: Callable) -> Callable:
-    """Add `--token` to a command that opens a server."""
-    text = "Secret part of the page's address, 16 to 128 characters.  [default: a new random one each time]"
-    return click.option("--token", envvar=TOKEN_VARIABLE, show_envvar=True, metavar="TEXT", help=text)(command)
 
 
 def is_verbose() -> bool:
@@ -251,6 +272,13 @@ def tell_bug(error: Exception) -> None:
         remedy = "Send this traceback with the take file to the developers of kinefit"
     _complain(f"an error in kinefit itself: {type(error).__name__}: {error}", **{"at": versions, "try": remedy + "."})
 
+
+token_option = click.option(
+    "--token", envvar=TOKEN_VARIABLE, show_envvar=True, metavar="TEXT",
+    help="Secret part of the page's address, 16 to 128 characters.  [default: a new random one each time]",
+)
+host_option = click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 admits other computers.")
+"""For commands that open a server."""
 
 hide_faces_option = click.option(
     "--hide-faces", is_flag=True,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from kinefit._files import write_text
 from kinefit.bodies import load_body
@@ -22,6 +21,22 @@ from kinefit.rigs.refine.result import Refinement
 from kinefit.rigs.sensors import fit_sensors
 from kinefit.sensors.alignment import SensorAlignment, alignment_line, marker_edits, misfits, moved_cameras
 from kinefit.takes.batch.results import Step
+
+
+@dataclass(frozen=True)
+class Refining:
+    """What a refinement estimates beside camera poses.
+
+    Parameters
+    ----------
+    points : TOML file of static points
+    focal, distortion, time_offsets : as of `refine`
+    """
+
+    points: Path | None = None
+    focal: bool = False
+    distortion: bool = False
+    time_offsets: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +66,11 @@ class Refined:
         return [*lines, *(alignment_line(fit) for fit in self.sensors)]
 
 
-def refined_of(found: Checked, step: Step, points: Path | None, **lenses_and_clocks: Any) -> Refined:
+def refined_of(found: Checked, step: Step, refining: Refining) -> Refined:
     """The cameras with keypoints refined, and other sensors against them.
 
     Where other sensors do not fit and the cameras have no fault, the cameras stay: a person's few steps place a sensor
-    better than all cameras anew. `lenses_and_clocks`: whether to refine "focal", "distortion" and "time_offsets" too.
+    better than all cameras anew.
 
     Raises
     ------
@@ -63,7 +78,7 @@ def refined_of(found: Checked, step: Step, points: Path | None, **lenses_and_clo
         Faults that must be fixed first; what `refine` raises.
     """
     wrong = misfits(found.sensors)
-    if wrong and points is None and not any(lenses_and_clocks.values()):
+    if wrong and refining == Refining():
         return Refined(None, wrong)
     if not found.biases:
         raise CalibrationError(
@@ -72,8 +87,9 @@ def refined_of(found: Checked, step: Step, points: Path | None, **lenses_and_clo
     rig, seen, take = found.views.rig, found.observations, found.take
     cameras = refine(
         rig, [k for k in seen.keypoints if k.camera in rig], load_body(take.body), height=take.height, up=take.up,
-        static_points=read_static_points(points, rig.names) if points else None,
-        sigma=min(entry.sigma for entry in take.keypoints), progress=step, **lenses_and_clocks,
+        static_points=read_static_points(refining.points, rig.names) if refining.points else None,
+        focal=refining.focal, distortion=refining.distortion, time_offsets=refining.time_offsets,
+        sigma=min(entry.sigma for entry in take.keypoints), progress=step,
     )  # fmt: skip
     return Refined(cameras, misfits(fit_sensors(take, seen, cameras.rig, progress=step)))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ from kinefit.cli import _screen
 from kinefit.cli._screen import CommandGroup
 
 if TYPE_CHECKING:
+    from kinefit.cli.markers._fit import MarkerFitOptions
     from kinefit.findings import Finding
     from kinefit.markers.take.takes import TakeIdentification
     from kinefit.observations import Markers
@@ -109,6 +111,17 @@ def write_set(takes: tuple[Path, ...], out: Path | None, name: str | None, unit:
     _screen.say(f"Next: check it, then kinefit markers learn {takes[0].name} --set {out}")
 
 
+def _method(method: str, **constants: float | None) -> Callable[..., TakeIdentification]:
+    """The identifier, or SAPM with its constants."""
+    from kinefit.markers.take.takes import identify_take
+    from kinefit.papers.unlabelled_markers import sapm_take
+
+    given: dict[str, Any] = {name: value for name, value in constants.items() if value is not None}
+    if given and method != "sapm":
+        raise click.UsageError(f"--{' and --'.join(given)}: only for SAPM, add --method sapm.")
+    return partial(sapm_take, **given) if method == "sapm" else identify_take
+
+
 @markers.command(epilog="""\b
 Examples:
   kinefit markers identify walk.c3d anna.json
@@ -121,17 +134,20 @@ Examples:
 @click.option("-o", "--out", type=_screen.PATH, help="Labelled take, .c3d or .trc.  [default: TAKE-named]")
 @click.option("--fill/--no-fill", default=True, show_default=True, help="Fill gaps of up to half a second.")
 @click.option("--rest", is_flag=True, help='Also write unassigned points, as "*1", "*2" ...')
-@click.option("--method", type=click.Choice(["identifier", "sapm"]), default="identifier", show_default=True,
-              help="The identifier, or the published SAPM for comparison: every frame anew, less reliable.")
-@click.option("--epsilon", type=click.FloatRange(0, 1, min_open=True), metavar="E",
-              help="SAPM: tolerated distortion, as a share of a segment's mean distance.  [default: 0.1]")
-@click.option("--beta", type=click.FloatRange(0, 1, max_open=True), metavar="B",
-              help="SAPM: share of a segment's points that a match must exceed.  [default: 0.8]")
+@_screen.options_record(
+    "method", _method,
+    click.option("--method", type=click.Choice(["identifier", "sapm"]), default="identifier", show_default=True,
+                 help="The identifier, or the published SAPM for comparison: every frame anew, less reliable."),
+    click.option("--epsilon", type=click.FloatRange(0, 1, min_open=True), metavar="E",
+                 help="SAPM: tolerated distortion, as a share of a segment's mean distance.  [default: 0.1]"),
+    click.option("--beta", type=click.FloatRange(0, 1, max_open=True), metavar="B",
+                 help="SAPM: share of a segment's points that a match must exceed.  [default: 0.8]"),
+)
 @_unit
 @_screen.verbose_option
 def identify(
-    take: Path, subjects: tuple[Path, ...], out: Path | None, fill: bool, rest: bool, method: str,
-    epsilon: float | None, beta: float | None, unit: str | None,
+    take: Path, subjects: tuple[Path, ...], out: Path | None, fill: bool, rest: bool,
+    method: Callable[..., TakeIdentification], unit: str | None,
 ) -> None:  # fmt: skip
     """Label the points of an unlabelled take.
 
@@ -139,18 +155,12 @@ def identify(
     ignored. Points without a certain label stay unlabelled. The worst doubtful frames are printed; a table lists all.
     """
     from kinefit.cli.markers._fit import identify_file
-    from kinefit.markers.take.takes import TakeSettings, identify_take
-    from kinefit.papers.unlabelled_markers import sapm_take
+    from kinefit.markers.take.takes import TakeSettings
 
-    given = (("epsilon", epsilon), ("beta", beta))
-    constants: dict[str, Any] = {name: value for name, value in given if value is not None}
-    if constants and method != "sapm":
-        raise click.UsageError(f"--{' and --'.join(constants)}: only for SAPM, add --method sapm.")
     settings = TakeSettings() if fill else TakeSettings(fill=0.0)
     with _screen.bars() as step:
         labelled, found, files = identify_file(
-            take, list(subjects), out, settings=settings, unit=unit, rest=rest, step=step,
-            method=partial(sapm_take, **constants) if method == "sapm" else identify_take,
+            take, list(subjects), out, settings=settings, unit=unit, rest=rest, step=step, method=method,
         )  # fmt: skip
     _tell(labelled, found)
     _screen.say("\nWritten:")
@@ -177,6 +187,13 @@ def _tell(labelled: Markers, found: dict[str, TakeIdentification]) -> None:
             _screen.say(f"  never found: {', '.join(never)}")
 
 
+def _fit_options(body: str, **others: Any) -> MarkerFitOptions:
+    """How markers are fitted."""
+    from kinefit.cli.markers._fit import MarkerFitOptions
+
+    return MarkerFitOptions(Path(body) if Path(body).suffix else body, **others)
+
+
 @markers.command(epilog="""\b
 Examples:
   kinefit markers fit walk-named.c3d
@@ -187,29 +204,34 @@ Examples:
 @click.option("-o", "--out", type=_screen.PATH, help="Folder of results.  [default: TAKE-kinefit]")
 @click.option("--subject", "subjects", multiple=True, type=_screen.PATH,
               help="Label the points first, with this file of `learn`; repeat for more people.")  # fmt: skip
-@click.option("--static", type=_screen.PATH, help="Labelled static trial of the same subject.")
-@click.option("--body", default="humanoid", show_default=True, help="Body of the catalogue, or a body file.")
-@click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the set that has the labels]")
-@click.option("--height", type=_screen.HEIGHT, metavar="M", help="Height of the subject, barefoot [m].")
-@click.option("--mass", type=click.FloatRange(2, 700), metavar="KG", help="Mass of the subject.  [default: by height]")
-@click.option("--up", type=click.Choice(["x", "y", "z"]), help="Vertical axis.  [default: estimated]")
-@click.option("--sides", type=click.Choice(["labelled", "exchanged", "mirrored-x", "mirrored-y", "mirrored-z"]),
-              help="How left and right are read: exchanged labels, a world with one axis negated, or as labelled "
-              "without a check.  [default: as labelled, checked]")
-@click.option("--limits/--no-limits", default=True, show_default=True, help="Keep joint angles within their limits.")
-@click.option("--smooth/--no-smooth", default=True, show_default=True, help="Fit all frames together, or each alone.")
+@_screen.options_record(
+    "options", _fit_options,
+    click.option("--static", type=_screen.PATH, help="Labelled static trial of the same subject."),
+    click.option("--body", default="humanoid", show_default=True, help="Body of the catalogue, or a body file."),
+    click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the set that has the labels]"),
+    click.option("--height", type=_screen.HEIGHT, metavar="M", help="Height of the subject, barefoot [m]."),
+    click.option("--mass", type=click.FloatRange(2, 700), metavar="KG",
+                 help="Mass of the subject.  [default: by height]"),
+    click.option("--up", type=click.Choice(["x", "y", "z"]), help="Vertical axis.  [default: estimated]"),
+    click.option("--sides", type=click.Choice(["labelled", "exchanged", "mirrored-x", "mirrored-y", "mirrored-z"]),
+                 help="How left and right are read: exchanged labels, a world with one axis negated, or as labelled "
+                 "without a check.  [default: as labelled, checked]"),
+    click.option("--limits/--no-limits", default=True, show_default=True,
+                 help="Keep joint angles within their limits."),
+    click.option("--smooth/--no-smooth", default=True, show_default=True,
+                 help="Fit all frames together, or each alone."),
+)
 @click.option("--formats", metavar="LIST",
               help="Formats to write.  [default: motion,csv,bvh,glb,trc,mot,osim,markers,report]")  # fmt: skip
 @_unit
 @_screen.verbose_option
 def fit(
-    take: Path, out: Path | None, subjects: tuple[Path, ...], static: Path | None, body: str, marker_set: str | None,
-    height: float | None, mass: float | None, up: str | None, sides: str | None, limits: bool, smooth: bool,
-    formats: str | None, unit: str | None,
+    take: Path, out: Path | None, subjects: tuple[Path, ...], options: MarkerFitOptions, formats: str | None,
+    unit: str | None,
 ) -> None:  # fmt: skip
     """Fit a body to markers: size and marker offsets from all frames, then joint angles."""
     from kinefit.cli._summary import print_files, print_summary
-    from kinefit.cli.markers._fit import WRITTEN, MarkerFitOptions, fit_file, identify_file
+    from kinefit.cli.markers._fit import WRITTEN, fit_file, identify_file
 
     out = out or take.with_name(f"{take.stem}-kinefit")
     chosen = WRITTEN if formats is None else tuple(part.strip().lower() for part in formats.split(",") if part.strip())
@@ -220,8 +242,6 @@ def fit(
             target = out / f"{take.stem}-named.c3d"
             labelled, named, files = identify_file(take, list(subjects), target, unit=unit, step=step)
             source, unit = files["markers"], None
-        known = Path(body) if Path(body).suffix else body
-        options = MarkerFitOptions(known, static, marker_set, height, up, limits, sides, smooth, mass)
         notes: list[Finding] = []
         found = fit_file(source, out, options, unit=unit, formats=chosen, step=step, notes=notes)
     if subjects:

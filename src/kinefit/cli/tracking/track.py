@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,71 +30,15 @@ def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -
 PICTURES = ("full", "blurred", "none")
 
 
-def choices_options(command: Callable) -> Callable:
-    """Add the options that say what is made of a take, given to the command as `Choices`, `choices`.
+def _choices(**chosen: Any) -> Choices:
+    """What is made of a take; refuses choices that exclude each other."""
+    from kinefit.takes.batch.one import Choices
 
-    The command gets `wanted`, too: whether overlays were asked for in so many words.
-    """
-    options = (
-        click.option("--overlays/--no-overlays", default=True, show_default=True, help="Write videos with the fit."),
-        click.option("--overlay-skin", is_flag=True, help="Draw the person's skin on the videos, too."),
-        click.option(
-            "--formats", default=",".join(DEFAULT_FORMATS), show_default=True, callback=chosen_formats,
-            metavar="LIST",
-            help=f"Formats to write. Others: {', '.join(sorted({*FORMATS.names()} - {*DEFAULT_FORMATS}))}.",
-        ),
-        click.option("--report/--no-report", default=True, show_default=True, help="Write report.html."),
-        click.option(
-            "--pictures", type=click.Choice(PICTURES), default="full", show_default=True,
-            help="Video images in report and overlays: all, or none. To hide only faces: --hide-faces.",
-        ),
-        _screen.hide_faces_option,
-        click.option("--contacts", is_flag=True, help="Keep soles still while they rest on the floor. Always on with "
-            "one camera, and with cameras calibrated from the people in view."),
-        click.option("--realtime", is_flag=True, help="Estimate each frame only from earlier frames (no smoothing)."),
-        click.option(
-            "--lag", type=float, metavar="SECONDS",
-            help="Estimate each frame from earlier frames and this many seconds of later frames, like a live session "
-            "with a delay.",
-        ),
-        click.option(
-            "--person", metavar="WHO",
-            help='Track one of several people: "first", "moving", "largest", "nearest X Y Z" or a number.  '
-            "[default: person of the take; else all people, each in a folder]",
-        ),
-        click.option(
-            "--restart", is_flag=True, help="Track all frames again.  [default: continue an interrupted run]"
-        ),
-    )  # fmt: skip
-
-    @wraps(command)
-    def called(*args: Any, **given: Any) -> Any:
-        from kinefit.takes.batch.one import Choices
-
-        chosen = {parameter: given.pop(parameter) for parameter in _CHOICES}
-        source = click.get_current_context().get_parameter_source("overlays")
-        wanted = (chosen["overlays"] and source == click.core.ParameterSource.COMMANDLINE) or chosen["overlay_skin"]
-        if chosen["pictures"] == "blurred":
-            _screen.note("--pictures blurred is outdated: use --hide-faces, which blurs all detected faces.")
-            chosen |= {"pictures": "full", "hide_faces": True}
-        chosen["smooth"] = not chosen.pop("realtime")
-        choices = Choices(**chosen)
-        _check(choices, wanted)
-        return command(*args, **given, choices=choices, wanted=wanted)
-
-    for option in reversed(options):
-        called = option(called)
-    return called
-
-
-_CHOICES = (
-    "overlays", "overlay_skin", "formats", "report", "pictures", "contacts", "realtime", "lag", "person", "restart",
-    "hide_faces",
-)  # fmt: skip
-
-
-def _check(choices: Choices, wanted: bool) -> None:
-    """Refuse choices that exclude each other."""
+    if chosen["pictures"] == "blurred":
+        _screen.note("--pictures blurred is outdated: use --hide-faces, which blurs all detected faces.")
+        chosen |= {"pictures": "full", "hide_faces": True}
+    chosen["smooth"] = not chosen.pop("realtime")
+    choices = Choices(**chosen)
     if choices.contacts and not choices.smooth:
         raise click.UsageError("--contacts needs the whole take, which --realtime does not use: give one of them.")
     if choices.lag is not None and (choices.contacts or not choices.smooth):
@@ -104,8 +46,49 @@ def _check(choices: Choices, wanted: bool) -> None:
         raise click.UsageError(f"{other}, --lag SECONDS uses that many seconds of later frames: give one of them.")
     if choices.overlay_skin and not choices.draws:
         raise click.UsageError("--overlay-skin draws on overlays; --no-overlays and --pictures none write none.")
-    if choices.pictures == "none" and wanted:
+    if choices.pictures == "none" and _needs_overlays(choices):
         raise click.UsageError("--overlays shows the videos, --pictures none does not: give one of them.")
+    return choices
+
+
+def _needs_overlays(choices: Choices) -> bool:
+    """Whether overlays were asked for in so many words."""
+    return choices.overlay_skin or (choices.overlays and _screen.is_stated("overlays"))
+
+
+choices_options = _screen.options_record(
+    "choices", _choices,
+    click.option("--overlays/--no-overlays", default=True, show_default=True, help="Write videos with the fit."),
+    click.option("--overlay-skin", is_flag=True, help="Draw the person's skin on the videos, too."),
+    click.option(
+        "--formats", default=",".join(DEFAULT_FORMATS), show_default=True, callback=chosen_formats,
+        metavar="LIST",
+        help=f"Formats to write. Others: {', '.join(sorted({*FORMATS.names()} - {*DEFAULT_FORMATS}))}.",
+    ),
+    click.option("--report/--no-report", default=True, show_default=True, help="Write report.html."),
+    click.option(
+        "--pictures", type=click.Choice(PICTURES), default="full", show_default=True,
+        help="Video images in report and overlays: all, or none. To hide only faces: --hide-faces.",
+    ),
+    _screen.hide_faces_option,
+    click.option("--contacts", is_flag=True, help="Keep soles still while they rest on the floor. Always on with "
+        "one camera, and with cameras calibrated from the people in view."),
+    click.option("--realtime", is_flag=True, help="Estimate each frame only from earlier frames (no smoothing)."),
+    click.option(
+        "--lag", type=float, metavar="SECONDS",
+        help="Estimate each frame from earlier frames and this many seconds of later frames, like a live session "
+        "with a delay.",
+    ),
+    click.option(
+        "--person", metavar="WHO",
+        help='Track one of several people: "first", "moving", "largest", "nearest X Y Z" or a number.  '
+        "[default: person of the take; else all people, each in a folder]",
+    ),
+    click.option(
+        "--restart", is_flag=True, help="Track all frames again.  [default: continue an interrupted run]"
+    ),
+)  # fmt: skip
+"""Options that say what is made of a take."""
 
 
 @click.command(short_help="Track the person of a take file and write all results.", epilog="""\b
@@ -125,8 +108,8 @@ Examples:
 @_screen.verbose_option
 @click.pass_context
 def track(
-    ctx: click.Context, take: Path, out: Path | None, choices: Choices, wanted: bool, as_json: bool
-) -> None:
+    ctx: click.Context, take: Path, out: Path | None, choices: Choices, as_json: bool
+) -> None:  # fmt: skip
     """Track the people of a take file and write all results.
 
     TAKE is a take file: a TOML file that names calibration, cameras, videos and keypoints (docs/take-file.md). It may
@@ -148,7 +131,7 @@ def track(
     take = write_first_take(take) if take.is_dir() and not takes_in(take) else find_take(take)
     out = out or take.with_name(f"{take.stem}-kinefit")
     people: list[dict[str, Any]] = []
-    code = run(take, out, choices, wanted=wanted, results=people)
+    code = run(take, out, choices, wanted=_needs_overlays(choices), results=people)
     if as_json:
         _screen.print_json({"take": str(take), "folder": str(out), "exit_code": code, "people": people})
     ctx.exit(code)
@@ -337,7 +320,7 @@ Exit codes: 0 where all takes are done, 2 where some have failed (the others are
 @click.pass_context
 def batch(
     ctx: click.Context, patterns: tuple[str, ...], out: Path, workers: int | None, cluster: str | None, retries: int,
-    time_limit: float, choices: Choices, wanted: bool,
+    time_limit: float, choices: Choices,
 ) -> None:
     """Track every take that PATTERN matches, like `kinefit track`, and write summary.html over all of them.
 
