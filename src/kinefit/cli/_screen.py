@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -62,7 +63,7 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 
 REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
-"""Errors of the system for which nobody is to blame but the disk."""
+"""Errors of the disk, not of kinefit or its user."""
 
 _VERBOSE, _QUIET, _EVENTS = "kinefit.verbose", "kinefit.quiet", "kinefit.events"
 _EVENTS_NICE = 10  # lower priority than the program that waits, whose page must answer
@@ -80,24 +81,19 @@ def _remember(key: str) -> Callable[[click.Context, click.Parameter, bool], bool
     return remember
 
 
-def options_record(
-    name: str, build: Callable[..., Any], *options: Callable[[Callable], Callable]
-) -> Callable[[Callable], Callable]:
-    """Add options to a command; it gets what `build` makes of their values, in one parameter of this name."""
+def gathered(name: str, build: Callable[..., Any] | str, *options: str) -> Callable[[Callable], Callable]:
+    """Give a command the values of some options as one argument: what `build` ("module:class", or a function) makes."""
 
-    def add(command: Callable) -> Callable:
+    def decorate(command: Callable) -> Callable:
         @wraps(command)
         def called(*args: Any, **given: Any) -> Any:
-            values = {key: given.pop(key) for key in keys}
-            return command(*args, **given, **{name: build(**values)})
+            values = {option: given.pop(option) for option in options}
+            make = resolve_name(build) if isinstance(build, str) else build
+            return command(*args, **given, **{name: make(**values)})
 
-        before = len(getattr(called, "__click_params__", ()))
-        for option in reversed(options):
-            called = option(called)
-        keys = [parameter.name for parameter in getattr(called, "__click_params__", ())[before:]]
         return called
 
-    return add
+    return decorate
 
 
 def is_stated(name: str) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,37 +22,6 @@ if TYPE_CHECKING:
 _COLOURS = {"sure": "green", "likely": "cyan", "guess": "yellow", "open": "bold red"}
 
 
-@dataclass(frozen=True)
-class ClickedStart:
-    """How clicked joints give the first pose.
-
-    Parameters
-    ----------
-    points : clicks as JSON; None: they are clicked in the browser
-    step : of the images that are shown; the first where None
-    body : name or file of the body; "humanoid" where None
-    browser : whether the page is opened
-    """
-
-    points: Path | None
-    step: int | None
-    body: str | None
-    browser: bool
-
-
-def _start_of(
-    clicked: bool, points: Path | None, step: int | None, body: str | None, browser: bool
-) -> ClickedStart | None:  # fmt: skip
-    """The start by clicks; None without."""
-    if clicked and points is not None:
-        raise click.UsageError("--click and --points exclude each other: give one.")
-    if step is not None and not clicked:
-        raise click.UsageError("--step needs --click; a file of --points has its own step.")
-    if body is not None and not (clicked or points):
-        raise click.UsageError("--body needs --click or --points; without them, write body into the take file.")
-    return ClickedStart(points, step, body, browser) if clicked or points is not None else None
-
-
 @click.command(short_help="Write a take file for the recording in a folder.", epilog="""\b
 Examples:
   kinefit init my_recording
@@ -64,27 +32,32 @@ Examples:
 @click.argument("folder", type=_screen.PATH)
 @click.option("-o", "--out", type=_screen.PATH, help="Take file.  [default: FOLDER/take.toml]")
 @click.option("--force", is_flag=True, help="Overwrite an existing take file.")
-@_screen.options_record(
-    "start", _start_of,
-    click.option("--click", "clicked", is_flag=True, help="Click joints in images, in the browser."),
-    click.option("--points", type=_screen.PATH, metavar="JSON", help="JSON file of clicked joints."),
-    click.option("--step", type=click.IntRange(min=0), help="With --click: step of the images.  [default: the first]"),
-    click.option("--body", metavar="BODY",
-                 help="Body for the clicks: of the catalogue, or a file.  [default: humanoid]"),
-    click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page of --click."),
-)
+@click.option("--click", "clicked", is_flag=True, help="Click joints in images, in the browser.")
+@click.option("--points", type=_screen.PATH, metavar="JSON", help="JSON file of clicked joints.")
+@click.option("--step", type=click.IntRange(min=0), help="With --click: step of the images.  [default: the first]")
+@click.option("--body", metavar="BODY", help="Body for the clicks: of the catalogue, or a file.  [default: humanoid]")
 @click.option(
     "--hide-faces", is_flag=True,
     help="Write copies of the videos with detected faces blurred; the take uses the copies.",
 )
+@click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page of --click.")
 @_screen.verbose_option
-def init(folder: Path, out: Path | None, force: bool, start: ClickedStart | None, hide_faces: bool) -> None:
+def init(
+    folder: Path, out: Path | None, force: bool, clicked: bool, points: Path | None, step: int | None,
+    body: str | None, browser: bool, hide_faces: bool,
+) -> None:
     """Write a take file for the recording in FOLDER: calibration, videos, keypoints, markers.
 
     All entries are guessed from names and contents of files. Each is printed with its confidence, which also stands as
     a comment in the file. Check the lines marked guess or open, then run kinefit check. No other file is changed; with
     --hide-faces, copies of the videos are written next to the take file.
     """
+    if clicked and points is not None:
+        raise click.UsageError("--click and --points exclude each other: give one.")
+    if step is not None and not clicked:
+        raise click.UsageError("--step needs --click; a file of --points has its own step.")
+    if body is not None and not (clicked or points):
+        raise click.UsageError("--body needs --click or --points; without them, write body into the take file.")
     from kinefit._files import write_text
     from kinefit.readers.guess.folder import guess_take
 
@@ -103,8 +76,8 @@ def init(folder: Path, out: Path | None, force: bool, start: ClickedStart | None
         with _screen.bars() as progress:
             copies = hide_in_copies(out, progress, _screen.note)
         _screen.say(f"{len(copies)} copies with blurred faces: {copies[0].parent}. The originals are unchanged.")
-    if start is not None:
-        start_from_clicks(out, start)
+    if clicked or points is not None:
+        start_from_clicks(out, points, step, body or "humanoid", browser)
     asked = any(note.about == "rate" and note.sure == "open" for note in guess.notes)
     alone = any(note.about == "cameras" and note.sure == "open" for note in guess.notes)
     bare = any(note.about == "intrinsics" and note.sure == "open" for note in guess.notes)
@@ -154,8 +127,16 @@ BODY = "clicked-body.npz"
 CLICKS = "clicks.json"
 
 
-def start_from_clicks(out: Path, start: ClickedStart) -> None:
-    """Put body and pose of clicked joints into the take file `out` that was just written."""
+def start_from_clicks(out: Path, points: Path | None, step: int | None, body: str, browser: bool) -> None:
+    """Put body and pose of clicked joints into a take file that was just written.
+
+    Parameters
+    ----------
+    out : the take file
+    points : clicks as JSON; None: they are clicked in the browser
+    step : of the images that are shown; the first where None
+    body : name or file of the body
+    """
     from kinefit.bodies import load_body
     from kinefit.readers.landmarks.annotations import read_clicks
     from kinefit.readers.take.file import read_take
@@ -163,14 +144,14 @@ def start_from_clicks(out: Path, start: ClickedStart) -> None:
     from kinefit.takes.missing import last_found
 
     take = last_found(read_take(out))
-    seen, generic = load_observations(take), load_body(start.body or "humanoid")
-    if seen.rig is None or (not seen.videos and start.points is None):
+    seen, generic = load_observations(take), load_body(body)
+    if seen.rig is None or (not seen.videos and points is None):
         remedy = "Add [calibration] and videos, or leave out --click."
         raise TakeError("--click needs videos of calibrated cameras; the take has none", file=out, remedy=remedy)
-    if start.points is not None:
-        _screen.say(_started(out, take, seen, generic, read_clicks(start.points)))
+    if points is not None:
+        _screen.say(_started(out, take, seen, generic, read_clicks(points)))
         return
-    _ask(out, take, seen, generic, seen.frames[0] if start.step is None else start.step, start.browser)
+    _ask(out, take, seen, generic, seen.frames[0] if step is None else step, browser)
 
 
 def _ask(out: Path, take: Take, seen: Observations, body: Body, step: int, browser: bool) -> None:
@@ -226,7 +207,7 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, steps: Seque
 
     from kinefit._files import regular, write_text
     from kinefit.bodies.serial import save_body
-    from kinefit.fitting.initialization.from_points import clickable, clicked_points, clicked_start
+    from kinefit.fitting.initialization.from_points import check_landmarks, clicked_points, clicked_start
     from kinefit.readers.landmarks.annotations import clicks_text
 
     assert seen.rig is not None
@@ -235,10 +216,7 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, steps: Seque
     if unknown:
         raise TrackingError(choices("camera of the take", unknown[0], seen.rig.names))
     every = [name for of in clicks.points.values() for name in of]
-    named = [name for step in steps for of in step.points.values() for name in of]
-    strange = [name for name in named if name not in body.landmarks.names]
-    if strange:
-        raise TrackingError(choices(f"landmark of body '{body.name}'", strange[0], clickable(body)))
+    check_landmarks(body, (name for step in steps for of in step.points.values() for name in of))
     once = [name for name in dict.fromkeys(every) if every.count(name) == 1]
     names = clicks.names
     uv = np.full((len(names), len(seen.rig), 2), np.nan)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -13,13 +13,6 @@ from kinefit.errors import FileError, printable
 if TYPE_CHECKING:
     from kinefit.studio.serving.access import Access
     from kinefit.studio.viewers.show import ViewerContent
-
-
-def _access(**options: Any) -> Access:
-    """Who may open the page."""
-    from kinefit.studio.serving.access import Access
-
-    return Access(**options)
 
 
 @click.command(short_help="Show a motion, a take or a folder of results in 3D.", epilog="""\b
@@ -33,12 +26,14 @@ Examples:
 @click.argument("sources", metavar="SOURCE [OTHER]...", nargs=-1, required=True, type=_screen.PATH)
 @click.option("--take", type=_screen.PATH, help="Take file that gives cameras and markers.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="0: any free port.")
-@_screen.options_record("access", _access, _screen.host_option, _screen.token_option)
+@_screen.host_option
+@_screen.token_option
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page in the browser.")
 @_screen.hide_faces_option
 @click.option("--cylinders", is_flag=True, help="Show the body's cylinders and bones instead of a skin.")
 @click.option("--html", type=_screen.PATH, help="Write one self-contained page instead of serving it.")
 @_screen.verbose_option
+@_screen.gathered("access", "kinefit.studio.serving.access:Access", "host", "token")
 def view(
     sources: tuple[Path, ...], take: Path | None, port: int, access: Access, browser: bool, cylinders: bool,
     html: Path | None, hide_faces: bool,
@@ -103,9 +98,10 @@ Examples:
 """)  # fmt: skip
 @click.argument("folder", type=_screen.PATH, default=".")
 @click.option("--port", type=click.IntRange(0, 65535), default=8090, show_default=True, help="0: any free one.")
-@_screen.options_record("access", _access, _screen.token_option)
+@_screen.token_option
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page.")
 @_screen.verbose_option
+@_screen.gathered("access", "kinefit.studio.serving.access:Access", "token")
 def app(folder: Path, port: int, access: Access, browser: bool) -> None:
     """Do all of it in a page of the browser: from a folder of videos to a report, corrections and exports.
 

@@ -92,14 +92,7 @@ class Descent(Generic[At]):
 
 @dataclass(frozen=True)
 class Damping:
-    """λ of `descend`, in the unit of its steps.
-
-    Parameters
-    ----------
-    first : to start with
-    least : below which it does not fall
-    most : at which the search ends
-    """
+    """First λ of `descend`, the least, and the λ at which the search ends, in the unit of its steps."""
 
     first: float
     least: float = _kernels_linear.LEAST_DAMPING

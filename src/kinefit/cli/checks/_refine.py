@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from kinefit._files import write_text
 from kinefit.bodies import load_body
@@ -21,22 +22,6 @@ from kinefit.rigs.refine.result import Refinement
 from kinefit.rigs.sensors import fit_sensors
 from kinefit.sensors.alignment import SensorAlignment, alignment_line, marker_edits, misfits, moved_cameras
 from kinefit.takes.batch.results import Step
-
-
-@dataclass(frozen=True)
-class Refining:
-    """What a refinement estimates beside camera poses.
-
-    Parameters
-    ----------
-    points : TOML file of static points
-    focal, distortion, time_offsets : as of `refine`
-    """
-
-    points: Path | None = None
-    focal: bool = False
-    distortion: bool = False
-    time_offsets: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +51,11 @@ class Refined:
         return [*lines, *(alignment_line(fit) for fit in self.sensors)]
 
 
-def refined_of(found: Checked, step: Step, refining: Refining) -> Refined:
+def refined_of(found: Checked, step: Step, points: Path | None, **lenses_and_clocks: Any) -> Refined:
     """The cameras with keypoints refined, and other sensors against them.
 
     Where other sensors do not fit and the cameras have no fault, the cameras stay: a person's few steps place a sensor
-    better than all cameras anew.
+    better than all cameras anew. `lenses_and_clocks`: whether to refine "focal", "distortion" and "time_offsets" too.
 
     Raises
     ------
@@ -78,7 +63,7 @@ def refined_of(found: Checked, step: Step, refining: Refining) -> Refined:
         Faults that must be fixed first; what `refine` raises.
     """
     wrong = misfits(found.sensors)
-    if wrong and refining == Refining():
+    if wrong and points is None and not any(lenses_and_clocks.values()):
         return Refined(None, wrong)
     if not found.biases:
         raise CalibrationError(
@@ -87,15 +72,14 @@ def refined_of(found: Checked, step: Step, refining: Refining) -> Refined:
     rig, seen, take = found.views.rig, found.observations, found.take
     cameras = refine(
         rig, [k for k in seen.keypoints if k.camera in rig], load_body(take.body), height=take.height, up=take.up,
-        static_points=read_static_points(refining.points, rig.names) if refining.points else None,
-        focal=refining.focal, distortion=refining.distortion, time_offsets=refining.time_offsets,
-        sigma=min(entry.sigma for entry in take.keypoints), progress=step,
+        static_points=read_static_points(points, rig.names) if points else None,
+        sigma=min(entry.sigma for entry in take.keypoints), progress=step, **lenses_and_clocks,
     )  # fmt: skip
     return Refined(cameras, misfits(fit_sensors(take, seen, cameras.rig, progress=step)))
 
 
 def write_refined(found: Checked, refined: Refined, path: Path) -> Path | None:
-    """Write the refined calibration beside the old one, and a copy of the take at `path` that uses it.
+    """Write the refined calibration next to the old one, and a copy of the take at `path` that uses it.
 
     Returns the copy; None where nothing changes.
 
@@ -120,17 +104,17 @@ def write_refined(found: Checked, refined: Refined, path: Path) -> Path | None:
     for entry in take.cameras:
         if abs(late.get(entry.name, 0.0)) > 1e-5:
             edits.append(Edit("camera", "time_offset", f"{entry.time_offset + late[entry.name]:.6f}", entry.name))
-    beside = free_name(path)
-    write_text(beside, edited(path.read_text("utf-8"), edits))
+    copy = free_name(path)
+    write_text(copy, edited(path.read_text("utf-8"), edits))
     try:
-        read_take(beside)
+        read_take(copy)
     except FileError as error:  # [calibration] twice: the take has it in another form
-        beside.unlink()
+        copy.unlink()
         remedy = f"Write it yourself: {in_words(edits, ' in ')}."
         raise TakeError("the refined file cannot be written into [calibration]", file=path, remedy=remedy) from error
-    _screen.say(f"\nWritten: {beside}, a copy of {path.name} with {in_words(edits, ' in ')}.")
-    _screen.say(f"Next:\n  {command('track', beside)}")
-    return beside
+    _screen.say(f"\nWritten: {copy}, a copy of {path.name} with {in_words(edits, ' in ')}.")
+    _screen.say(f"Next:\n  {command('track', copy)}")
+    return copy
 
 
 def _relative(path: Path, folder: Path) -> str:

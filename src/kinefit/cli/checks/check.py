@@ -12,7 +12,7 @@ from kinefit.cli import _screen
 from kinefit.errors import KinefitError
 
 if TYPE_CHECKING:
-    from kinefit.cli.checks._refine import Refined, Refining
+    from kinefit.cli.checks._refine import Refined
     from kinefit.findings import Edit
     from kinefit.rigs.diagnostics.checks import Checked
     from kinefit.takes.batch.results import Step
@@ -26,31 +26,16 @@ Examples:
 _PRINTED = ("camera", "bias u, v [px]", "±", "spread", "late [frames]", "left/right swapped")
 
 
-def _refining(refine: bool, points: Path | None, **lenses_and_clocks: bool) -> Refining | None:
-    """What `--refine` refines; None without it."""
-    from kinefit.cli.checks._refine import Refining
-
-    refining = Refining(points, **lenses_and_clocks)
-    if not refine and refining != Refining():
-        raise click.UsageError("--focal, --distortion, --time-offsets and --points need --refine.")
-    if points is not None and not points.is_file():
-        raise click.BadParameter(f"no such file: {points}", param_hint="--points")
-    return refining if refine else None
-
-
 @click.command(short_help="Find faults of a recording; refine its calibration.", epilog=_EXAMPLES)
 @click.argument("take", type=_screen.PATH)
 @click.option("-o", "--out", type=_screen.PATH, help="HTML page to write.  [default: TAKE-check.html]")
-@_screen.options_record(
-    "refining", _refining,
-    click.option("--refine", is_flag=True, help="Write a refined calibration and a take that uses it, as new files."),
-    click.option("--focal", is_flag=True, help="With --refine: refine focal lengths too."),
-    click.option("--distortion", is_flag=True, help="With --refine: refine lens distortion too."),
-    click.option("--time-offsets", is_flag=True, help="With --refine: refine time offsets too."),
-    click.option(
-        "--points", type=_screen.PATH,
-        help="With --refine: TOML file of static points: [NAME], then CAMERA = [u, v] px in the calibration's image.",
-    ),
+@click.option("--refine", is_flag=True, help="Write a refined calibration and a take that uses it, as new files.")
+@click.option("--focal", is_flag=True, help="With --refine: refine focal lengths too.")
+@click.option("--distortion", is_flag=True, help="With --refine: refine lens distortion too.")
+@click.option("--time-offsets", is_flag=True, help="With --refine: refine time offsets too.")
+@click.option(
+    "--points", type=_screen.PATH,
+    help="With --refine: TOML file of static points: [NAME], then CAMERA = [u, v] px in the calibration's image.",
 )
 @click.option("--fix", is_flag=True, help="Write what corrects faults into the take, then check again.")
 @_screen.hide_faces_option
@@ -58,7 +43,8 @@ def _refining(refine: bool, points: Path | None, **lenses_and_clocks: bool) -> R
 @_screen.quiet_options
 @_screen.verbose_option
 def check(
-    take: Path, out: Path | None, refining: Refining | None, fix: bool, strict: bool, hide_faces: bool, as_json: bool
+    take: Path, out: Path | None, refine: bool, focal: bool, distortion: bool, time_offsets: bool,
+    points: Path | None, fix: bool, strict: bool, hide_faces: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Find faults of a recording, with their confidence and how to correct them.
 
@@ -66,6 +52,10 @@ def check(
     of the cameras, their clocks, images scaled or letterboxed after the calibration, left and right, floor and
     vertical, the view of each camera, and whether depth cameras and marker systems fit the videos.
     """
+    if (focal or distortion or time_offsets or points) and not refine:
+        raise click.UsageError("--focal, --distortion, --time-offsets and --points need --refine.")
+    if points is not None and not points.is_file():
+        raise click.BadParameter(f"no such file: {points}", param_hint="--points")
     from kinefit._files import write_text
     from kinefit.cli._screen import check_file
     from kinefit.cli.checks._page import check_page
@@ -91,9 +81,9 @@ def check(
             else:
                 fixed += wanted
                 found, content = _checked(take, hide_faces, step)
-        if refining and failed is None:
+        if refine and failed is None:
             try:
-                refined = refined_of(found, step, refining)
+                refined = refined_of(found, step, points, focal=focal, distortion=distortion, time_offsets=time_offsets)
             except KinefitError as error:
                 failed = error
     if fixed:

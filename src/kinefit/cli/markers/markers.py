@@ -134,17 +134,15 @@ Examples:
 @click.option("-o", "--out", type=_screen.PATH, help="Labelled take, .c3d or .trc.  [default: TAKE-named]")
 @click.option("--fill/--no-fill", default=True, show_default=True, help="Fill gaps of up to half a second.")
 @click.option("--rest", is_flag=True, help='Also write unassigned points, as "*1", "*2" ...')
-@_screen.options_record(
-    "method", _method,
-    click.option("--method", type=click.Choice(["identifier", "sapm"]), default="identifier", show_default=True,
-                 help="The identifier, or the published SAPM for comparison: every frame anew, less reliable."),
-    click.option("--epsilon", type=click.FloatRange(0, 1, min_open=True), metavar="E",
-                 help="SAPM: tolerated distortion, as a share of a segment's mean distance.  [default: 0.1]"),
-    click.option("--beta", type=click.FloatRange(0, 1, max_open=True), metavar="B",
-                 help="SAPM: share of a segment's points that a match must exceed.  [default: 0.8]"),
-)
+@click.option("--method", type=click.Choice(["identifier", "sapm"]), default="identifier", show_default=True,
+              help="The identifier, or the published SAPM for comparison: every frame anew, less reliable.")
+@click.option("--epsilon", type=click.FloatRange(0, 1, min_open=True), metavar="E",
+              help="SAPM: tolerated distortion, as a share of a segment's mean distance.  [default: 0.1]")
+@click.option("--beta", type=click.FloatRange(0, 1, max_open=True), metavar="B",
+              help="SAPM: share of a segment's points that a match must exceed.  [default: 0.8]")
 @_unit
 @_screen.verbose_option
+@_screen.gathered("method", _method, "method", "epsilon", "beta")
 def identify(
     take: Path, subjects: tuple[Path, ...], out: Path | None, fill: bool, rest: bool,
     method: Callable[..., TakeIdentification], unit: str | None,
@@ -187,13 +185,6 @@ def _tell(labelled: Markers, found: dict[str, TakeIdentification]) -> None:
             _screen.say(f"  never found: {', '.join(never)}")
 
 
-def _fit_options(body: str, **others: Any) -> MarkerFitOptions:
-    """How markers are fitted."""
-    from kinefit.cli.markers._fit import MarkerFitOptions
-
-    return MarkerFitOptions(Path(body) if Path(body).suffix else body, **others)
-
-
 @markers.command(epilog="""\b
 Examples:
   kinefit markers fit walk-named.c3d
@@ -204,27 +195,25 @@ Examples:
 @click.option("-o", "--out", type=_screen.PATH, help="Folder of results.  [default: TAKE-kinefit]")
 @click.option("--subject", "subjects", multiple=True, type=_screen.PATH,
               help="Label the points first, with this file of `learn`; repeat for more people.")  # fmt: skip
-@_screen.options_record(
-    "options", _fit_options,
-    click.option("--static", type=_screen.PATH, help="Labelled static trial of the same subject."),
-    click.option("--body", default="humanoid", show_default=True, help="Body of the catalogue, or a body file."),
-    click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the set that has the labels]"),
-    click.option("--height", type=_screen.HEIGHT, metavar="M", help="Height of the subject, barefoot [m]."),
-    click.option("--mass", type=click.FloatRange(2, 700), metavar="KG",
-                 help="Mass of the subject.  [default: by height]"),
-    click.option("--up", type=click.Choice(["x", "y", "z"]), help="Vertical axis.  [default: estimated]"),
-    click.option("--sides", type=click.Choice(["labelled", "exchanged", "mirrored-x", "mirrored-y", "mirrored-z"]),
-                 help="How left and right are read: exchanged labels, a world with one axis negated, or as labelled "
-                 "without a check.  [default: as labelled, checked]"),
-    click.option("--limits/--no-limits", default=True, show_default=True,
-                 help="Keep joint angles within their limits."),
-    click.option("--smooth/--no-smooth", default=True, show_default=True,
-                 help="Fit all frames together, or each alone."),
-)
+@click.option("--static", type=_screen.PATH, help="Labelled static trial of the same subject.")
+@click.option("--body", default="humanoid", show_default=True, help="Body of the catalogue, or a body file.")
+@click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the set that has the labels]")
+@click.option("--height", type=_screen.HEIGHT, metavar="M", help="Height of the subject, barefoot [m].")
+@click.option("--mass", type=click.FloatRange(2, 700), metavar="KG", help="Mass of the subject.  [default: by height]")
+@click.option("--up", type=click.Choice(["x", "y", "z"]), help="Vertical axis.  [default: estimated]")
+@click.option("--sides", type=click.Choice(["labelled", "exchanged", "mirrored-x", "mirrored-y", "mirrored-z"]),
+              help="How left and right are read: exchanged labels, a world with one axis negated, or as labelled "
+              "without a check.  [default: as labelled, checked]")
+@click.option("--limits/--no-limits", default=True, show_default=True, help="Keep joint angles within their limits.")
+@click.option("--smooth/--no-smooth", default=True, show_default=True, help="Fit all frames together, or each alone.")
 @click.option("--formats", metavar="LIST",
               help="Formats to write.  [default: motion,csv,bvh,glb,trc,mot,osim,markers,report]")  # fmt: skip
 @_unit
 @_screen.verbose_option
+@_screen.gathered(
+    "options", "kinefit.cli.markers._fit:MarkerFitOptions",
+    "static", "body", "marker_set", "height", "mass", "up", "sides", "limits", "smooth",
+)  # fmt: skip
 def fit(
     take: Path, out: Path | None, subjects: tuple[Path, ...], options: MarkerFitOptions, formats: str | None,
     unit: str | None,

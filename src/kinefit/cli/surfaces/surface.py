@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -11,13 +11,6 @@ from kinefit.cli import _screen
 
 if TYPE_CHECKING:
     from kinefit.cli.surfaces._measure import Wanted
-
-
-def _wanted(**options: Any) -> Wanted:
-    """What is measured, and how."""
-    from kinefit.cli.surfaces._measure import Wanted
-
-    return Wanted(**options)
 
 
 @click.command(short_help="Measure a surface without a body: points, mesh, strain.", epilog="""\b
@@ -30,45 +23,45 @@ Examples:
 """)  # fmt: skip
 @click.argument("calibration", type=_screen.PATH)
 @click.argument("views", nargs=-1, metavar="CAMERA=PATH...")
+@click.option("-o", "--out", type=_screen.PATH, default=Path("surface"), help="Output folder.")
 @click.option("--unit", default="auto", help="Calibration's unit: m, cm, mm, or metres.  [default: as it states]")
+@click.option("--window", default="13", show_default=True, help="Side of the matched windows [px], odd; or 'texture'.")
+@click.option("--step", type=click.IntRange(1), default=6, show_default=True, help="Grid spacing [px].")
+@click.option("--mask", type=_screen.PATH, help="PNG mask of the first image, black outside the surface.")
+@click.option(
+    "--seeds", type=_screen.PATH,
+    help="CSV of known points: u and v in each camera, in the order of the views.  [default: found automatically]",
+)  # fmt: skip
+@click.option("--least", type=click.FloatRange(0, 1), help="Smallest correlation of a match.  [default: 0.8]")
+@click.option("--gauge", type=click.FloatRange(min=0, min_open=True), help="Gauge length of the strain [mm].")
+@click.option("--incremental", is_flag=True, help="Refer each state to the previous state, not to the first.")
+@click.option("--still", type=click.IntRange(1), help="State without motion: its strain is the noise floor.")
+@click.option("--smooth", type=click.FloatRange(0, 5), default=0.0, help="Gaussian blur [px], for aliased texture.")
 @click.option(
     "--flat", type=click.FloatRange(min=0, min_open=True), metavar="MM",
     help="One camera that faces a flat surface; MM is the width of a pixel on it, in mm.",
 )  # fmt: skip
-@_screen.options_record(
-    "wanted", _wanted,
-    click.option("-o", "--out", type=_screen.PATH, default=Path("surface"), help="Output folder."),
-    click.option("--window", default="13", show_default=True,
-                 help="Side of the matched windows [px], odd; or 'texture'."),
-    click.option("--step", type=click.IntRange(1), default=6, show_default=True, help="Grid spacing [px]."),
-    click.option("--mask", type=_screen.PATH, help="PNG mask of the first image, black outside the surface."),
-    click.option(
-        "--seeds", type=_screen.PATH,
-        help="CSV of known points: u and v in each camera, in the order of the views.  [default: found automatically]",
-    ),
-    click.option("--least", type=click.FloatRange(0, 1), help="Smallest correlation of a match.  [default: 0.8]"),
-    click.option("--gauge", type=click.FloatRange(min=0, min_open=True), help="Gauge length of the strain [mm]."),
-    click.option("--incremental", is_flag=True, help="Refer each state to the previous state, not to the first."),
-    click.option("--still", type=click.IntRange(1), help="State without motion: its strain is the noise floor."),
-    click.option("--smooth", type=click.FloatRange(0, 5), default=0.0, help="Gaussian blur [px], for aliased texture."),
-    click.option(
-        "--motion", type=_screen.PATH,
-        help="Videos: motion.npz, or its folder, of the body in view; it predicts where lost points reappear.",
-    ),
-    click.option(
-        "--bounds", type=(float, float), metavar="M/S M/S²",
-        help="Videos: largest speed and acceleration of a path; a path ends where it exceeds them.",
-    ),
-    click.option(
-        "--bright", type=click.IntRange(3), metavar="PX",
-        help="Videos: track bright points (retroreflective spheres), at most PX wide, by their centroids.",
-    ),
-    click.option("--reach", type=click.IntRange(1), metavar="PX",
-                 help="Videos: half side of search boxes.  [default: 8]"),
-    click.option("--neighbours", is_flag=True, help="Videos: also reject points whose neighbours were rejected."),
-    click.option("--field", type=click.Choice(["odd", "even"]), help="Interlaced images: use only these lines."),
+@click.option(
+    "--motion", type=_screen.PATH,
+    help="Videos: motion.npz, or its folder, of the body in view; it predicts where lost points reappear.",
 )  # fmt: skip
+@click.option(
+    "--bounds", type=(float, float), metavar="M/S M/S²",
+    help="Videos: largest speed and acceleration of a path; a path ends where it exceeds them.",
+)  # fmt: skip
+@click.option(
+    "--bright", type=click.IntRange(3), metavar="PX",
+    help="Videos: track bright points (retroreflective spheres), at most PX wide, by their centroids.",
+)  # fmt: skip
+@click.option("--reach", type=click.IntRange(1), metavar="PX", help="Videos: half side of search boxes.  [default: 8]")
+@click.option("--neighbours", is_flag=True, help="Videos: also reject points whose neighbours were rejected.")
+@click.option("--field", type=click.Choice(["odd", "even"]), help="Interlaced images: use only these lines.")
 @_screen.verbose_option
+@_screen.gathered(
+    "wanted", "kinefit.cli.surfaces._measure:Wanted",
+    "out", "window", "step", "mask", "seeds", "least", "gauge", "incremental", "still", "smooth", "motion", "bounds",
+    "bright", "reach", "neighbours", "field",
+)  # fmt: skip
 def surface(
     calibration: Path, views: tuple[str, ...], unit: str, flat: float | None, wanted: Wanted
 ) -> None:  # fmt: skip

@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,45 +27,6 @@ def _address(ctx: click.Context, parameter: click.Parameter, value: str | None) 
     return host.strip("[]"), int(port)
 
 
-@dataclass(frozen=True)
-class Targets:
-    """Where poses are sent, as the options say."""
-
-    page: bool
-    port: int
-    host: str
-    token: str | None
-    vmc: tuple[str, int] | None
-    lsl: str | None
-    lines: str | None
-
-    @property
-    def quiet(self) -> bool:
-        """Whether the standard output is for poses alone."""
-        return self.lines == "-"
-
-    def programs(self, rate: float, up: str) -> Iterator[Receiver]:
-        """Receivers other than the page, of poses at a rate [Hz] in a world with this vertical axis."""
-        from kinefit.studio.live.receivers import websocket
-
-        if self.lines is not None:
-            yield websocket.JsonLines(self.lines)
-        if self.vmc is not None:
-            yield websocket.Vmc(*self.vmc, up=up)
-        if self.lsl is not None:
-            yield websocket.Lsl(self.lsl, rate=rate)
-
-    def served(self, session: LiveSession, title: str) -> Receiver:
-        """The page of a session, whose address is printed."""
-        from kinefit.studio.live.receivers.websocket import WebSockets
-
-        page = WebSockets(self.port, host=self.host, token=self.token, title=title, ask=session.ask)
-        if page.access.warning:
-            _screen.note(f"warning: {page.access.warning}")
-        _screen.say(f"page and poses at {page.url}", stderr=self.quiet)
-        return page
-
-
 @click.command(short_help="Track a person live, and stream the poses.", epilog="""\b
 Examples:
   kinefit live take.toml                       a recorded take, replayed in real time
@@ -76,15 +36,13 @@ Examples:
 """)  # fmt: skip
 @click.argument("take", type=_screen.PATH)
 @click.option("-o", "--out", type=_screen.PATH, help="Folder of the session.  [default: TAKE-live]")
-@_screen.options_record(
-    "targets", Targets,
-    click.option("--page/--no-page", default=True, show_default=True, help="Serve a web page, and poses by WebSocket."),
-    click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="0: any free port."),
-    _screen.host_option, _screen.token_option,
-    click.option("--vmc", callback=_address, metavar="HOST:PORT", help="Send poses to an avatar by VMC over OSC."),
-    click.option("--lsl", metavar="NAME", help="Send angles and joints to the Lab Streaming Layer (extra `lsl`)."),
-    click.option("--json", "lines", metavar="FILE", help="Write each pose as a line of JSON; - is standard output."),
-)  # fmt: skip
+@click.option("--page/--no-page", default=True, show_default=True, help="Serve a web page, and poses by WebSocket.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="0: any free port.")
+@_screen.host_option
+@_screen.token_option
+@click.option("--vmc", callback=_address, metavar="HOST:PORT", help="Send poses to an avatar by VMC over OSC.")
+@click.option("--lsl", metavar="NAME", help="Send angles and joints to the Lab Streaming Layer (extra `lsl`).")
+@click.option("--json", "lines", metavar="FILE", help="Write each pose as a line of JSON; - is standard output.")
 @click.option(
     "--speed", type=click.FloatRange(0.0), default=1.0, show_default=True,
     help="Speed factor of a replayed take; 0: as fast as tracking allows, without dropped frames.",
@@ -94,7 +52,10 @@ Examples:
     "--record/--no-record", default=True, show_default=True, help="Write the motion and a take into the folder."
 )
 @_screen.verbose_option
-def live(take: Path, out: Path | None, targets: Targets, speed: float, seconds: float | None, record: bool) -> None:
+def live(
+    take: Path, out: Path | None, page: bool, port: int, host: str, token: str | None, vmc: tuple[str, int] | None,
+    lsl: str | None, lines: str | None, speed: float, seconds: float | None, record: bool,
+) -> None:
     """Track a person live, and stream the poses.
 
     TAKE is a take file. Sensors with a `stream` are read live: a webcam's number, an address such as rtsp://..., or a
@@ -107,21 +68,29 @@ def live(take: Path, out: Path | None, targets: Targets, speed: float, seconds: 
     """
     from kinefit.readers.take.file import read_take
     from kinefit.simulation.recordings import warm_depth, warm_keypoints
+    from kinefit.studio.live.receivers import websocket
     from kinefit.studio.live.record import MotionRecord
     from kinefit.studio.live.take import folder_of, live_session
 
     entry = read_take(take)
+    quiet = lines == "-"
     receivers: list[Receiver] = []
     folder = (out or folder_of(entry)) if record else None
     session: LiveSession = live_session(entry, speed=speed, folder=folder, tell=_screen.note)
     try:
         rate, up = session.tracker.rate, entry.up
-        receivers.extend(targets.programs(rate, up))
+        receivers += [] if lines is None else [websocket.JsonLines(lines)]
+        receivers += [] if vmc is None else [websocket.Vmc(*vmc, up=up)]
+        receivers += [] if lsl is None else [websocket.Lsl(lsl, rate=rate)]
         kept = None if folder is None else MotionRecord(folder, rate=rate, up=up, name=entry.name)
         if kept is not None:
             receivers.append(kept)
-        if targets.page:  # the last: its thread, once it has a pose, takes its turns with whoever is still to get it
-            receivers.append(targets.served(session, entry.name))
+        if page:  # the last: its thread, once it has a pose, takes its turns with whoever is still to get it
+            served = websocket.WebSockets(port, host=host, token=token, title=entry.name, ask=session.ask)
+            receivers.append(served)
+            if served.access.warning:
+                _screen.note(f"warning: {served.access.warning}")
+            _screen.say(f"page and poses at {served.url}", stderr=quiet)
         warm_depth() if entry.depth or entry.stereo else warm_keypoints()
     except BaseException:  # Ctrl-C while it warms up, too
         for receiver in receivers:
@@ -131,7 +100,7 @@ def live(take: Path, out: Path | None, targets: Targets, speed: float, seconds: 
     session.receivers = tuple(receivers)
     with _ctrl_c(session):
         session.run(seconds)
-    _tell(session, kept, targets.quiet)
+    _tell(session, kept, quiet)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,39 +57,46 @@ def _needs_overlays(choices: Choices) -> bool:
     return choices.overlay_skin or (choices.overlays and _screen.is_stated("overlays"))
 
 
-choices_options = _screen.options_record(
-    "choices", _choices,
-    click.option("--overlays/--no-overlays", default=True, show_default=True, help="Write videos with the fit."),
-    click.option("--overlay-skin", is_flag=True, help="Draw the person's skin on the videos, too."),
-    click.option(
-        "--formats", default=",".join(DEFAULT_FORMATS), show_default=True, callback=chosen_formats,
-        metavar="LIST",
-        help=f"Formats to write. Others: {', '.join(sorted({*FORMATS.names()} - {*DEFAULT_FORMATS}))}.",
-    ),
-    click.option("--report/--no-report", default=True, show_default=True, help="Write report.html."),
-    click.option(
-        "--pictures", type=click.Choice(PICTURES), default="full", show_default=True,
-        help="Video images in report and overlays: all, or none. To hide only faces: --hide-faces.",
-    ),
-    _screen.hide_faces_option,
-    click.option("--contacts", is_flag=True, help="Keep soles still while they rest on the floor. Always on with "
-        "one camera, and with cameras calibrated from the people in view."),
-    click.option("--realtime", is_flag=True, help="Estimate each frame only from earlier frames (no smoothing)."),
-    click.option(
-        "--lag", type=float, metavar="SECONDS",
-        help="Estimate each frame from earlier frames and this many seconds of later frames, like a live session "
-        "with a delay.",
-    ),
-    click.option(
-        "--person", metavar="WHO",
-        help='Track one of several people: "first", "moving", "largest", "nearest X Y Z" or a number.  '
-        "[default: person of the take; else all people, each in a folder]",
-    ),
-    click.option(
-        "--restart", is_flag=True, help="Track all frames again.  [default: continue an interrupted run]"
-    ),
-)  # fmt: skip
-"""Options that say what is made of a take."""
+def choices_options(command: Callable) -> Callable:
+    """Add the options that say what is made of a take, given to the command as `Choices`, `choices`."""
+    options = (
+        click.option("--overlays/--no-overlays", default=True, show_default=True, help="Write videos with the fit."),
+        click.option("--overlay-skin", is_flag=True, help="Draw the person's skin on the videos, too."),
+        click.option(
+            "--formats", default=",".join(DEFAULT_FORMATS), show_default=True, callback=chosen_formats,
+            metavar="LIST",
+            help=f"Formats to write. Others: {', '.join(sorted({*FORMATS.names()} - {*DEFAULT_FORMATS}))}.",
+        ),
+        click.option("--report/--no-report", default=True, show_default=True, help="Write report.html."),
+        click.option(
+            "--pictures", type=click.Choice(PICTURES), default="full", show_default=True,
+            help="Video images in report and overlays: all, or none. To hide only faces: --hide-faces.",
+        ),
+        _screen.hide_faces_option,
+        click.option("--contacts", is_flag=True, help="Keep soles still while they rest on the floor. Always on with "
+            "one camera, and with cameras calibrated from the people in view."),
+        click.option("--realtime", is_flag=True, help="Estimate each frame only from earlier frames (no smoothing)."),
+        click.option(
+            "--lag", type=float, metavar="SECONDS",
+            help="Estimate each frame from earlier frames and this many seconds of later frames, like a live session "
+            "with a delay.",
+        ),
+        click.option(
+            "--person", metavar="WHO",
+            help='Track one of several people: "first", "moving", "largest", "nearest X Y Z" or a number.  '
+            "[default: person of the take; else all people, each in a folder]",
+        ),
+        click.option(
+            "--restart", is_flag=True, help="Track all frames again.  [default: continue an interrupted run]"
+        ),
+    )  # fmt: skip
+    command = _screen.gathered(
+        "choices", _choices, "overlays", "overlay_skin", "formats", "report", "pictures", "contacts", "realtime", "lag",
+        "person", "restart", "hide_faces",
+    )(command)
+    for option in reversed(options):
+        command = option(command)
+    return command
 
 
 @click.command(short_help="Track the person of a take file and write all results.", epilog="""\b

@@ -148,7 +148,7 @@ def _over_cycle(curve: Curve, values: NDArray, row: int, of: str) -> list[dict]:
 
 
 def _range(sides: list[Curve]) -> list[float]:
-    """Of the vertical axis: all values with their usual bands, but a band may not squeeze the curve to a line."""
+    """Of the vertical axis: all values with their error bands, but a band may not squeeze the curve to a line."""
     low, high = min(c.values.min() for c in sides), max(c.values.max() for c in sides)
     least = 10.0 if sides[0].unit == "deg" else 0.05
     stds = np.concatenate([c.std for c in sides])

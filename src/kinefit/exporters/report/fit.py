@@ -113,8 +113,8 @@ def quality_plot(motion: Motion, moments: Sequence[Moment]) -> p.Html:
         whole = len(level) <= p.MAX_CURVE_POINTS or not len(known)
         at = np.arange(len(level)) if whole else known[p.thinned(level[known])]
         hover, row = f"{name} %{{y:.1f}} {unit}", 1 + units.index(r.unit)
-        stroke = p.Stroke(p.SERIES[k % len(p.SERIES)], 1.4)
-        traces.append(p.line(times[at], level[at], name, stroke, hover=hover, row=row, legend=True))
+        colour = p.SERIES[k % len(p.SERIES)]
+        traces.append(p.line(times[at], level[at], name, p.Stroke(colour, 1.4), hover=hover, row=row, legend=True))
     axes: list[dict[str, Any]] = [{"title": "quality", "range": [0, 1.03]}]
     axes += [{"title": f"residual [{SHOWN_UNITS[unit][1]}]", "rangemode": "tozero"} for unit in units]
     marks: list[dict[str, Any]] = [

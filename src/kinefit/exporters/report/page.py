@@ -221,7 +221,7 @@ def quote(text: str) -> Html:
 
 
 def file_link(path: str, text: str | None = None) -> Html:
-    """Link to a file that lies beside the page, by its relative path."""
+    """Link to a file that lies next to the page, by its relative path."""
     return Html(f'<a href="{escape(urlquote(path))}">{inline(path if text is None else text)}</a>')
 
 

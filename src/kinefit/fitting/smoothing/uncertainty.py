@@ -51,7 +51,7 @@ MOTION_CORRELATION_TIME = 0.1
 
 _BY_MEASUREMENTS = 0.8  # of a smoothed fit's variance, by errors of measurements, the rest by accelerations. 0.78 to
 # 0.83 by the spectrum of a motion prior that averages 0.2 s, at 30 to 100 Hz, with accelerations of 0.05 to 0.3 s
-_LARGEST = 6e4  # [m, rad] of what is kept, which 16 bits hold: of what nothing observes
+_MAX_STORED = 6e4  # [m, rad] of what is kept, which 16 bits hold: of what nothing observes
 _DIRECTIONS = 120  # of lasting errors that are kept. The sigma of differences on the balancing trial is within 0.3 %
 # of that with all; with 60 within 6 %, with 20 within 43 %
 _NOISE_STRETCHES = 6  # of a long take, from which the detectors' noise is estimated: 12,000 frames are enough
@@ -214,8 +214,8 @@ class _KeyFrames:
         k = int(np.searchsorted(self.errors.frames, frame))
         if k < len(self.errors.frames) and self.errors.frames[k] == frame:
             constant, drift = _with_shapes(errors, shapes, frame), errors.drift
-            self.errors.constant[k] = np.clip(product(constant, self.constant), -_LARGEST, _LARGEST)
-            self.errors.drift[k] = np.clip(product(drift, self.drift), -_LARGEST, _LARGEST)
+            self.errors.constant[k] = np.clip(product(constant, self.constant), -_MAX_STORED, _MAX_STORED)
+            self.errors.drift[k] = np.clip(product(drift, self.drift), -_MAX_STORED, _MAX_STORED)
             if (k + 1) % KEYS_AT_ONCE == 0:
                 release(self.errors.constant, self.errors.drift)
 
@@ -335,13 +335,7 @@ def pixel_columns(
 
 
 class Averaged(NamedTuple):
-    """What a smoothed fit averages.
-
-    Parameters
-    ----------
-    frames : int, their number
-    assumed : (N,) [px²] variance of a channel's errors, all of which the fit counts as white
-    """
+    """Number of frames that a smoothed fit averages; variances (N,) [px²] of channels that it counts as white."""
 
     frames: int
     assumed: NDArray

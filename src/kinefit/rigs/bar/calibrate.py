@@ -278,10 +278,10 @@ def _adjusted(
         placed = place(rig, uv, length, limit, (0.05, 0.02, 0.01, 0.01)[n] * length)
         used = np.isfinite(placed.x_world).all(axis=(1, 2))
         _check_count(int(used.sum()), len(uv))
-        problem = BarProblem(placed.uv[used], length, sigma, (1e-3, 1e-3, 1e-4, 1e-4)[n] * length)
         found = adjust_bar(
-            rig, placed.x_world[used], problem, interiors=not known, rounds=3 if n < 3 else 8, iterations=20
-        )
+            rig, placed.x_world[used], BarProblem(placed.uv[used], length, sigma, (1e-3, 1e-3, 1e-4, 1e-4)[n] * length),
+            interiors=not known, rounds=3 if n < 3 else 8, iterations=20,
+        )  # fmt: skip
         rig, sigma = found[0].rig, found[2].sigma
     return bar_bundle(*found), placed.uv[used], used, placed.ambiguous
 
@@ -300,8 +300,10 @@ def _grown(rig: Rig, uv: NDArray, length: float, known: bool) -> tuple[Rig, floa
         if used.sum() < MIN_PLACES:
             return rig, np.inf, np.zeros(len(rig))
         fits = np.isfinite(placed.uv).all(axis=(2, 3))
-        problem = BarProblem(placed.uv[used], length, sigma, 5e-3 * length)
-        found = adjust_bar(rig, placed.x_world[used], problem, interiors=not known, rounds=2, iterations=15)
+        found = adjust_bar(
+            rig, placed.x_world[used], BarProblem(placed.uv[used], length, sigma, 5e-3 * length),
+            interiors=not known, rounds=2, iterations=15,
+        )  # fmt: skip
         rig, sigma = found[0].rig, found[2].sigma
     return rig, sigma, fits.sum(axis=0) / np.maximum(shared.sum(axis=0), 1)
 
