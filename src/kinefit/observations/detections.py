@@ -204,7 +204,7 @@ class Detections:
         Raises
         ------
         ObservationError
-            Nobody, or no face, is seen in any frame; faces were not looked for.
+            No person, or no face, is detected in any frame; faces were not looked for.
         """
         if not self.seen.any():
             raise ObservationError(

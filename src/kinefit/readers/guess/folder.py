@@ -155,7 +155,7 @@ def _describe_depth(draft: Draft, files: Sequence[Path], videos: Sequence[Path],
 def _depth_of(path: Path) -> tuple[DepthVideo, dict[str, Value]]:
     """A recording of depth, and its entry `rate` where no file states one."""
     try:
-        return read_depth(path, usual_rate=None), {}
+        return read_depth(path, default_rate=None), {}
     except ObservationError:
         video = read_depth(path)
         return video, {"rate": Value(video.rate, "guess", "that of nearly every depth camera: its files state none")}

@@ -143,7 +143,7 @@ class KeypointsEntry(TakeEntry, frozen=True, kw_only=True):
     """`[[keypoints]]`: what a detector saw in one camera."""
 
     camera: str
-    file: Path | None = None  # or folder; default, of "detect" only: what `kinefit detect` leaves beside the take
+    file: Path | None = None  # or folder; default, of "detect" only: what `kinefit detect` leaves next to the take
     stream: Path | None = None  # of `kinefit live`, in place of a file: a folder that OpenPose's JSON files come into
     format: str = "openpose"  # of `KEYPOINTS`, or "detect" or "skin"
     set: str | None = None  # default: by the number or the names of the points, MEDIAPIPE_33, HANDS of skin
@@ -223,7 +223,7 @@ class DepthEntry(TakeEntry, frozen=True, kw_only=True):
     size: tuple[_Side, _Side] | None = None  # [px] (width, height), of raw files
     range: tuple[_Reach, _Reach] | None = None  # [m] (near, far): what is measured outside of it is dropped
     intrinsics: tuple[_Focal, _Focal, float, float] | None = None  # [px] fx, fy, cx, cy, in a take without calibration
-    distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] beside the intrinsics
+    distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] besides the intrinsics
     rate: Rate | None = None  # [Hz]; default: what the file states, the take's, the videos'
     time_unit: _Scale | None = None  # [s] of the last number in every file's name, where that is the time
     time_offset: Seconds = 0.0  # [s] time of the first frame
