@@ -93,10 +93,10 @@ def _pickled_texts(raw: bytes) -> list[str]:
     for operation, argument, _ in pickletools.genops(raw):
         name = operation.name
         if "UNICODE" in name:
-            text = argument
-            texts.append(argument)
+            text = str(argument)
+            texts.append(text)
         elif "GET" in name:
-            text = memo[argument]
+            text = memo[int(argument or 0)]
             texts += [text] if text is not None else []
         elif "PUT" in name or name == "MEMOIZE":
             memo[len(memo) if argument is None else argument] = text

@@ -284,7 +284,7 @@ def calibrate_people(
         alone = [steady_person(record) for record in keypoints]
     keypoints = [in_step(record, n, frames) for record, n in zip(keypoints, late, strict=True)]
     seen = [_common(body, given, one, late, frames, sigma) for one in (alone, *others)]
-    (points, uv), *others = seen
+    (points, uv), *further = seen
     rig = first or first_rig(given, uv.reshape(-1, len(given), 2), sigma)
     step("first cameras", 1, 2)
     spread = np.broadcast_to(GUESSED_FOCAL_SIGMA if focal is True else focal, len(given)).astype(float)
@@ -301,7 +301,7 @@ def calibrate_people(
         return _on_the_floor(rig, seen, body, height, known_length, up)
 
     trial = PersonTrial(keypoints, body, up, sigma)
-    free = free_points(rig, [u for _, u in others], sigma)
+    free = free_points(rig, [u for _, u in further], sigma)
     found = refine_from(rig, trial, prior, stand, free=free, progress=progress, from_scratch=True)
     offsets = {name: found.time_offsets[name] + float(n) / rate for name, n in zip(rig.names, late, strict=True)}
     clocks = {name: replace(found.cameras[name], time=offsets[name]) for name in rig.names}
