@@ -50,9 +50,10 @@ _MESH_NAMES = {k: f"face_{name}" for k, name in _MESH.items()} | {
 MEDIAPIPE_478 = tuple(_MESH_NAMES.get(k, f"face_{k}") for k in range(478))
 """Names of the points of MediaPipe's face mesh, in its order; the last ten are the irises'."""
 
+_OPENPOSE_FINGERS = "Thumb Index Middle Ring Little"
 OPENPOSE_HAND_42 = tuple(
     f"{side}Hand{point}" for side in "LR"
-    for point in ("Wrist", *(f"{finger}{k}" for finger in "Thumb Index Middle Ring Little".split() for k in (1, 2, 3, 4)))
+    for point in ("Wrist", *(f"{finger}{k}" for finger in _OPENPOSE_FINGERS.split() for k in range(1, 5)))
 )  # fmt: skip
 """Names of the points of both hands of OpenPose and COCO-WholeBody, which are in MediaPipe's order."""
 
@@ -145,7 +146,9 @@ class Detections:
         if lifted is not None:
             what = f"lifted landmarks of camera {self.camera}"
             lifted = frozen(lifted, float, what, (*points.shape[:3], 3), self.source)
-        for part, confidence_of, shape_of in (("hands", "hand_confidence", (2, 21)), ("face", "face_confidence", (478,))):
+        shapes: dict[str, tuple[int, ...]] = {"hand": (2, 21), "face": (478,)}
+        for part, confidence_of in (("hands", "hand_confidence"), ("face", "face_confidence")):
+            shape_of = shapes[part[:4]]
             values, confidences = getattr(self, part), getattr(self, confidence_of)
             if values is not None or confidences is not None:
                 what, shape = f"{part} of camera {self.camera}", (*points.shape[:2], *shape_of)

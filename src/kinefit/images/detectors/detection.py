@@ -55,8 +55,8 @@ class _DetectionTrack:
 class PersonDetection:
     """One person in one image: column, landmarks (K, 2) [px], confidence (K,), runs of the mask, lifted (K, 3) [m].
 
-    lifted: None where the network gives none. hands: points (2, 21, 2) [px] and confidence (2, 21) of the left and the right hand; face: points (478, 2) [px] and
-    confidence (478,); None unless they were looked for.
+    lifted: None where the network gives none. hands: points (2, 21, 2) [px] and confidence (2, 21) of the left and the
+    right hand; face: points (478, 2) [px] and confidence (478,); None unless they were looked for.
     """
 
     column: int

@@ -93,7 +93,7 @@ class OnnxNetwork:
             raise FileError(f"not a network that onnxruntime runs ({told})", file=path, remedy=remedy) from error
         inputs = self._session.get_inputs()
         shape = list(inputs[0].shape) if len(inputs) == 1 else []
-        if len(shape) != 4 or shape[1] != 3 or shape[0] not in (1, None) and not isinstance(shape[0], str):
+        if len(shape) != 4 or shape[1] != 3 or (shape[0] not in (1, None) and not isinstance(shape[0], str)):
             told = ", ".join(f"{one.name} {list(one.shape)}" for one in inputs)
             problem = f"its inputs are {told}, not one image (1, 3, height, width)"
             raise FileError(problem, file=path, remedy="Export it with one image as the input, its colours first.")
