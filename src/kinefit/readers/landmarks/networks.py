@@ -41,6 +41,7 @@ from kinefit.readers.landmarks.keypoint_sets import HAND_POINTS, KEYPOINT_SETS
 from kinefit.readers.plugins import Extension, Extensions
 
 _SETS = ("COCO_17", "HALPE_26", "COCO_WHOLEBODY_133", "BODY_25", "MEDIAPIPE_33")  # told by the number of points
+_CORRECT = "Correct the name there."
 
 _Three = tuple[float, float, float]
 _Scale = Annotated[float, msgspec.Meta(gt=0)]
@@ -179,14 +180,14 @@ def _names(network: Path, stated: NetworkDescription, count: int) -> tuple[str, 
             raise FileError(problem, file=network, remedy=remedy)
         points = sets[count]
     if isinstance(points, str):
-        check_choice("keypoint set", points, KEYPOINT_SETS, FileError, file=file, place="points")
+        check_choice("keypoint set", points, KEYPOINT_SETS, FileError, file=file, place="points", remedy=_CORRECT)
         keypoint_set, names = points, KEYPOINT_SETS[points]
     else:
         sets_of = (name for name, known in KEYPOINT_SETS.items() if set(points) <= set(known))
         keypoint_set, names = next(sets_of, ""), tuple(points)
     if stated.mapping:
         for name, k in stated.mapping.items():
-            check_choice("point", name, names, FileError, file=file, place="mapping")
+            check_choice("point", name, names, FileError, file=file, place="mapping", remedy=_CORRECT)
             if k >= count:
                 raise FileError(
                     f"{name} is point {k} of {count}", file=file, place="mapping", remedy="Count them from 0."
