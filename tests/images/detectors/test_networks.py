@@ -244,7 +244,7 @@ def test_two_people_have_columns_of_their_own(network, tmp_path):
 
 
 def test_sigma_is_read_and_makes_confidences(tmp_path):
-    sigma = NetworkSigma(confidence=[0.2, 0.6, 0.9], sigma=[0.08, 0.02, 0.01])
+    sigma = NetworkSigma(confidence=[0.2, 0.6, 0.9], sigma=[0.08, 0.02, 0.01], points={"RShoulder": 2.0})
     assert write_sigma(sigma, tmp_path / "own.onnx").name == "own.sigma.toml"
     assert read_sigma(tmp_path / "own.onnx") == sigma and read_sigma(tmp_path / "other.onnx") is None
     from kinefit.observations import Keypoints
@@ -255,6 +255,7 @@ def test_sigma_is_read_and_makes_confidences(tmp_path):
     made = sigma.calibrated(Keypoints("c", "COCO_17", KEYPOINT_SETS["COCO_17"], 10.0, points, confidence), 17)
     assert made.sigma == pytest.approx(0.01 * 2 * 192.0)  # the extent of the points, 192 px in the crop
     np.testing.assert_allclose(made.confidence[0, 0, :4], [1.0, 0.0, 0.04, 0.25])
+    assert made.confidence[0, 0, 6] == pytest.approx(0.25 / 4.0), "its own factor"
     np.testing.assert_allclose(made.sigma / np.sqrt(made.confidence[0, 0, 3]), 0.02 * 2 * 192.0)
     for text in ("confidence = [0.5]\nsigma = [0.1, 0.2]", "confidence = [0.5, 0.7]\nsigma = [0.1, 0.2]", "sigma = 1"):
         (tmp_path / "own.sigma.toml").write_text(text)

@@ -15,6 +15,7 @@ leaves:
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -210,13 +211,18 @@ def open_people(network: Path, threads: int = 1, aspect: float = 1.0) -> BoxPeop
 
 
 class NetworkSigma(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Standard deviation of a network's points by their confidence, linear in between; what NETWORK.sigma.toml states.
+    """Standard deviation of a network's points by their confidence; what NETWORK.sigma.toml states.
 
-    confidence : increasing; sigma : the same number, falling, shares of the extent of a person's points in the image
+    Parameters
+    ----------
+    confidence : increasing
+    sigma : the same number, falling, shares of the extent of a person's points in the image; linear in between
+    points : {name: factor of a point's own}; 1 for others
     """
 
     confidence: list[Annotated[float, msgspec.Meta(ge=0, le=1)]]
     sigma: list[_Scale]
+    points: dict[str, _Scale] = {}  # noqa: RUF012 (as above)
 
     def __post_init__(self) -> None:
         if not 0 < len(self.confidence) == len(self.sigma):
@@ -224,20 +230,22 @@ class NetworkSigma(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         if np.any(np.diff(self.confidence) <= 0) or np.any(np.diff(self.sigma) > 0):
             raise ValueError("confidence has to increase, and sigma to fall")
 
-    def of(self, confidence: NDArray) -> NDArray:
-        """Shares of a person's extent, of confidences of any shape."""
-        return np.interp(confidence, self.confidence, self.sigma)
+    def of(self, confidence: NDArray, names: Sequence[str]) -> NDArray:
+        """(..., K) shares of a person's extent, of confidences (..., K) of points (K,)."""
+        factors = np.array([self.points.get(name, 1.0) for name in names])
+        return np.asarray(np.interp(confidence, self.confidence, self.sigma) * factors)
 
     def calibrated(self, record: Keypoints, count: int) -> Keypoints:
         """The record with its standard deviation [px] at confidence 1, and the confidences that are right beside it.
 
         `count`: of its points that are the network's, the first ones.
         """
-        best, extent = min(self.sigma), extent_px(record.points[..., :count, :], record.confidence[..., :count])
+        names, extent = record.names[:count], extent_px(record.points[..., :count, :], record.confidence[..., :count])
+        best = float(self.of(np.ones(count), names).min())
         if not np.isfinite(extent).any():
             return record
         confidence, own = np.array(record.confidence), record.confidence[..., :count]
-        confidence[..., :count] = np.where(own > 0, (best / self.of(own)) ** 2, 0.0)
+        confidence[..., :count] = np.where(own > 0, (best / self.of(own, names)) ** 2, 0.0)
         return replace(record, confidence=confidence, sigma=best * float(np.nanmedian(extent)))
 
 
@@ -266,5 +274,7 @@ def write_sigma(found: NetworkSigma, network: Path) -> Path:
 
     text = "# Standard deviation of this network's points by their confidence, in extents of a person's points.\n"
     file = sigma_file(network)
-    write_text(file, f"{text}confidence = {listed(found.confidence)}\nsigma = {listed(found.sigma)}\n")
+    text += f"confidence = {listed(found.confidence)}\nsigma = {listed(found.sigma)}\n\n[points]\n"
+    text += "".join(f"{json.dumps(name)} = {factor:.4g}\n" for name, factor in found.points.items())
+    write_text(file, text)
     return file

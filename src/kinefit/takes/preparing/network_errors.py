@@ -32,20 +32,24 @@ class HeldOutErrors:
 
     Parameters
     ----------
-    camera : (N,) int, number in the rig
+    names : (K,) of all points
+    camera, point : (N,) int, number in the rig, number in the names
     confidence : (N,)
     off : (N,) as shares of the person's extent in the image
     off_m : (N,) [m] at the point's depth
     """
 
+    names: tuple[str, ...]
     camera: NDArray
+    point: NDArray
     confidence: NDArray
     off: NDArray
     off_m: NDArray
 
     def of(self, chosen: NDArray) -> HeldOutErrors:
         """Some of them, (N,) bool."""
-        return HeldOutErrors(self.camera[chosen], self.confidence[chosen], self.off[chosen], self.off_m[chosen])
+        arrays = (self.camera, self.point, self.confidence, self.off, self.off_m)
+        return HeldOutErrors(self.names, *(array[chosen] for array in arrays))
 
 
 def held_out_errors(rig: Rig, keypoints: Sequence[Keypoints]) -> HeldOutErrors:
@@ -62,7 +66,7 @@ def held_out_errors(rig: Rig, keypoints: Sequence[Keypoints]) -> HeldOutErrors:
     confidence = np.stack([record.confidence[:, 0] for record in records], axis=2)
     confidence = np.where(np.isfinite(uv).all(axis=-1), confidence, 0.0)
     extent = np.stack([extent_px(r.points, r.confidence)[:, 0] for r in records], axis=1)  # (F, C)
-    found = [np.zeros((4, 0))]
+    found = [np.zeros((5, 0))]
     for c, number in enumerate(numbers):
         others = [k for k in range(len(numbers)) if k != c]
         cameras = Rig(tuple(rig.cameras[numbers[k]] for k in others))
@@ -75,28 +79,37 @@ def held_out_errors(rig: Rig, keypoints: Sequence[Keypoints]) -> HeldOutErrors:
         gap = np.linalg.norm(camera.project(x).reshape(uv[:, :, c].shape) - uv[:, :, c], axis=2)
         depth = (x @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]).reshape(gap.shape)
         rows = np.stack([
-            np.full(gap.shape, float(number)), confidence[:, :, c], gap / extent[:, c, None],
-            gap * depth / camera.matrix[0, 0],
+            np.full(gap.shape, float(number)), np.broadcast_to(np.arange(gap.shape[1]), gap.shape),
+            confidence[:, :, c], gap / extent[:, c, None], gap * depth / camera.matrix[0, 0],
         ])  # fmt: skip
-        known = np.isfinite(rows).all(axis=0) & (rows[1] > 0) & (depth > 0)
+        known = np.isfinite(rows).all(axis=0) & (rows[2] > 0) & (depth > 0)
         found.append(rows[:, known])
-    camera, *others_of = np.concatenate(found, axis=1)
-    return HeldOutErrors(camera.astype(int), *others_of)
+    numbers_of, point, *rest = np.concatenate(found, axis=1)
+    return HeldOutErrors(records[0].names, numbers_of.astype(int), point.astype(int), *rest)
 
 
 def sigma_of_confidence(errors: HeldOutErrors) -> NetworkSigma | None:
-    """Standard deviation by confidence: falling, from the median of each of some bins; None for too few points."""
+    """Standard deviation by confidence, falling, from the median of each of some bins; and a factor of each point.
+
+    None for too few points.
+    """
     count = min(_BINS, len(errors.off) // _MIN_BIN_POINTS)
     if count < 1:
         return None
+    overall = np.median(errors.off)
+    factors = np.ones(len(errors.names))
+    for k in np.flatnonzero(np.bincount(errors.point, minlength=len(factors)) >= _MIN_BIN_POINTS):
+        factors[k] = np.median(errors.off[errors.point == k]) / overall
+    off = errors.off / factors[errors.point]
     edges = np.unique(np.quantile(errors.confidence, np.linspace(0.0, 1.0, count + 1)[1:-1]))
     own = np.searchsorted(edges, errors.confidence, "right")
     bins, size = np.unique(own, return_counts=True)
     middle = np.array([np.median(errors.confidence[own == b]) for b in bins])
-    sigma = np.array([np.median(errors.off[own == b]) for b in bins]) / _RAYLEIGH_MEDIAN
+    sigma = np.array([np.median(off[own == b]) for b in bins]) / _RAYLEIGH_MEDIAN
     falling = isotonic_regression(sigma, weights=size, increasing=False).x
     middle, first = np.unique(np.clip(middle, 0.0, 1.0), return_index=True)
-    return NetworkSigma(confidence=middle.tolist(), sigma=np.maximum(falling[first], 1e-6).tolist())
+    points = dict(zip(errors.names, factors.tolist()))
+    return NetworkSigma(confidence=middle.tolist(), sigma=np.maximum(falling[first], 1e-6).tolist(), points=points)
 
 
 def calibrate_network(take: Take, network: Path) -> tuple[Path, NetworkSigma, int]:

@@ -1,0 +1,1 @@
+"""Benchmarks of networks of a user's own."""
