@@ -45,10 +45,9 @@ def simcc_network(path: Path, count: int = 17, size: Any = (192, 256), bins: int
 
 def _written(
     path: Path, nodes: list[Any], outputs: dict[str, list[Any]], count: int, size: Any, *, half: bool = False,
-    constants: dict[str, Any] | None = None, batch: Any = "N", domain: str = "",
+    constants: dict[str, Any] | None = None, domain: str = "",
 ) -> Path:  # fmt: skip
-    """A file of a network from an image by likeness and blur to `nodes`; `domain` of an operator that no runtime has."""
-    import onnx
+    """A network from an image by likeness and blur to `nodes`; `domain` of an operator that no runtime has."""
     from onnx import TensorProto, helper, numpy_helper
 
     wanted = ((COLOURS[:count] - _MEAN) / _STD).astype(np.float32)
@@ -71,7 +70,7 @@ def _written(
         begin.append(node("Absent", ["smooth"], ["other"], domain=domain))
     kind = TensorProto.FLOAT16 if half else TensorProto.FLOAT
     graph = helper.make_graph(
-        [*begin, *nodes], "by colour", [helper.make_tensor_value_info("image", kind, [batch, 3, size[1], size[0]])],
+        [*begin, *nodes], "by colour", [helper.make_tensor_value_info("image", kind, ["N", 3, size[1], size[0]])],
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in outputs.items()],
         [numpy_helper.from_array(np.asarray(value), name) for name, value in weights.items()],
     )  # fmt: skip
@@ -88,37 +87,34 @@ def save(graph: Any, path: Path, domain: str = "") -> Path:
     return path
 
 
-def constant_network(path: Path, outputs: dict[str, NDArray], size: Any = (192, 256), **given: Any) -> Path:
-    """A network that gives the same outputs for every image, as large as its brightest value where they are floats."""
+def constant_network(path: Path, outputs: dict[str, NDArray], size: Any = (192, 256), gain: float = 0.0) -> Path:
+    """A network of the same outputs for every image; with a `gain`, scores of boxes by the image's brightest value."""
     from onnx import TensorProto, helper, numpy_helper
 
-    kind = given.get("kind", TensorProto.FLOAT)
     nodes = [
         helper.make_node("ReduceMax", ["image"], ["bright"], keepdims=0),
         helper.make_node("Mul", ["bright", "gain"], ["lit"]),
     ]
-    weights, infos = {"gain": np.array(given.get("gain", 0.0), np.float32)}, []
+    weights, infos = {"gain": np.array(gain, np.float32)}, []
     for name, value in outputs.items():
         weights[f"{name}_value"] = value
         scores = np.zeros(value.shape, np.float32)
-        scores[..., 4 : 5] = given.get("gain", 0.0) > 0  # of boxes, without an image nobody
-        operator = "Identity"
-        if value.dtype == np.float32 and value.ndim == 3 and scores.any():
+        scores[..., 4:5] = gain > 0
+        if scores.any():
             weights[f"{name}_lit"], weights[f"{name}_always"] = scores * value, value * (1 - scores)
             nodes.append(helper.make_node("Mul", [f"{name}_lit", "lit"], [f"{name}_of"]))
             nodes.append(helper.make_node("Add", [f"{name}_of", f"{name}_always"], [name]))
         else:
-            nodes.append(helper.make_node(operator, [f"{name}_value"], [name]))
+            nodes.append(helper.make_node("Identity", [f"{name}_value"], [name]))
         of = TensorProto.FLOAT if value.dtype == np.float32 else TensorProto.INT64
         infos.append(helper.make_tensor_value_info(name, of, value.shape))
-    shape = given.get("shape", [1, 3, size[1], size[0]])
-    image = [helper.make_tensor_value_info("image", kind, shape)]
+    image = [helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, size[1], size[0]])]
     arrays = [numpy_helper.from_array(np.asarray(value), name) for name, value in weights.items()]
     return save(helper.make_graph(nodes, "constant", image, infos, arrays), path)
 
 
 def yolox_network(path: Path, box: tuple[float, float, float, float], size: int = 160, score: float = 0.9) -> Path:
-    """YOLOX, (1, A, 85), that finds one person in a box (centre u, v, width, height) [px] of images that are not black."""
+    """YOLOX (1, A, 85): one person in a box (centre u, v, width, height) [px] of images that are not black."""
     cells = [(u, v, s) for s in (8, 16, 32) for v in range(size // s) for u in range(size // s)]
     raw = np.zeros((1, len(cells), 85), np.float32)
     k = next(k for k, (u, v, s) in enumerate(cells) if s == 32 and (u, v) == (2, 2))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -40,7 +41,7 @@ def run() -> None:
         figure("networks_cost", max(shares), "of the network's own run", "<= 0.1")
 
 
-def _difference(file: Path, decode: object) -> float:
+def _difference(file: Path, decode: Callable[[list[NDArray]], NDArray]) -> float:
     """Largest distance [px] of kinefit's points in an image from the published ones."""
     find, layout = open_points(file)
     session = onnx_runtime().InferenceSession(str(file), providers=["CPUExecutionProvider"])
@@ -56,7 +57,7 @@ def _difference(file: Path, decode: object) -> float:
         there = (corners / _SIZE * scale + centre - scale / 2).astype(np.float32)
         crop = cv2.warpAffine(image, cv2.getAffineTransform(there, corners), _SIZE, flags=cv2.INTER_LINEAR)
         values = ((crop - _MEAN) / _STD).transpose(2, 0, 1)[None].astype(np.float32)
-        own = decode(session.run(None, {"image": values}))  # type: ignore[operator]
+        own = decode(session.run(None, {"image": values}))
         worst = max(worst, float(np.linalg.norm(points - (own / _SIZE * scale + centre - scale / 2), axis=1).max()))
     return worst
 
@@ -82,8 +83,9 @@ def _heatmaps(outputs: list[NDArray]) -> NDArray:
 
 def _large(file: Path, name: str) -> Path:
     """A network of random convolutions with as many operations as RTMPose-m."""
-    from benchmarks.scenes.onnx_networks import save
     from onnx import TensorProto, helper, numpy_helper
+
+    from benchmarks.scenes.onnx_networks import save
 
     rng, width = np.random.default_rng(1), 128
     cells = _SIZE[0] // 8 * _SIZE[1] // 8
@@ -125,7 +127,8 @@ def _cost(file: Path) -> float:
     session = onnx_runtime().InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
     rng = np.random.default_rng(2)
     image = rng.integers(0, 256, (1080, 1920, 3), np.uint8)
-    values, roi = rng.normal(size=(1, 3, _SIZE[1], _SIZE[0])).astype(np.float32), Roi(np.array([900.0, 500.0]), 700.0, 0.0)
+    values = rng.normal(size=(1, 3, _SIZE[1], _SIZE[0])).astype(np.float32)
+    roi = Roi(np.array([900.0, 500.0]), 700.0, 0.0)
     spent = np.empty((amount(60, 5), 2))
     for own in spent:
         begin = time.process_time()

@@ -35,12 +35,12 @@ def run() -> None:
     except (AssetError, ObservationError) as error:
         raise NotMeasured(error.problem) from error
     trial = recording("video_balancing_4cam")
-    error, area = _judged(trial / "videos", trial / "Calib_refined_static.toml")
-    figure("networks_sigma_calibration", error, "mean difference of shares", "<= 0.1")
+    off, area = _judged(trial / "videos", trial / "Calib_refined_static.toml")
+    figure("networks_sigma_calibration", off, "mean difference of shares", "<= 0.1")
     figure("networks_sigma_far", area, "area under the curve", ">= 0.92")
     two = recording("video_two_people_4cam")
-    error, area = _judged(two, two / "Calib.qca.txt")
-    print(f"# two people, images moved: difference of shares {error:.3f}, area under the curve {area:.3f}")
+    off, area = _judged(two, two / "Calib.qca.txt")
+    print(f"# two people, images moved: difference of shares {off:.3f}, area under the curve {area:.3f}")
 
 
 def _judged(videos: Path, calibration: Path) -> tuple[float, float]:
@@ -63,6 +63,6 @@ def _judged(videos: Path, calibration: Path) -> tuple[float, float]:
         off, far = float(np.abs(within - _PROBABILITIES).mean()), own.off_m > _FAR_M
         ranks, count = rankdata(said)[far].sum(), int(far.sum())
         area = (ranks - count * (count + 1) / 2) / max(count * (len(far) - count), 1)
-        print(f"# {camera}: {len(far)} points, {100 * far.mean():.1f} % far off, calibration {off:.3f}, area {area:.3f}")
+        print(f"# {camera}: {len(far)} points, {100 * far.mean():.1f} % far, calibration {off:.3f}, area {area:.3f}")
         judged.append((off, area))
     return tuple(np.mean(judged, axis=0).tolist())  # type: ignore[return-value]

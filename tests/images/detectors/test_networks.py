@@ -214,7 +214,8 @@ def test_a_second_look_exchanges_left_and_right():
     assert {a: names[layout.names.index(a)] for a in pairs} == pairs
     assert sorted(layout.mirror) == list(range(133)) and [layout.mirror[k] for k in layout.mirror] == list(range(133))
     assert [BLAZEPOSE.names[k] for k in BLAZEPOSE.sides("wrist")] == ["left_wrist", "right_wrist"]
-    assert BLAZEPOSE.head == list(range(11)) and [layout.names[k] for k in layout.sides("wrist")] == ["LWrist", "RWrist"]
+    assert BLAZEPOSE.head == list(range(11))
+    assert [layout.names[k] for k in layout.sides("wrist")] == ["LWrist", "RWrist"]
 
 
 def test_two_people_have_columns_of_their_own(network, tmp_path):
@@ -266,7 +267,8 @@ def test_sigma_is_read_and_makes_confidences(tmp_path):
 def test_a_plug_in_reads_files_of_its_own(tmp_path, monkeypatch):
     (tmp_path / "own.pt").touch()
     layout = PointLayout("COCO_17", KEYPOINT_SETS["COCO_17"], (192, 256))
-    own = NetworkFormat(summary="PyTorch", suffixes=(".pt",), load=lambda path, threads: (lambda crop: (path, 1), layout))
+    load = lambda path, threads: (lambda crop: (path, 1), layout)
+    own = NetworkFormat(summary="PyTorch", suffixes=(".pt",), load=load)
     monkeypatch.setattr(type(NETWORKS), "names", lambda self: ("torch",))
     monkeypatch.setattr(type(NETWORKS), "get", lambda self, name: own)
     find, found = open_points(tmp_path / "own.pt")

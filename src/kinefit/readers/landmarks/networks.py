@@ -222,7 +222,7 @@ class NetworkSigma(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     confidence: list[Annotated[float, msgspec.Meta(ge=0, le=1)]]
     sigma: list[_Scale]
-    points: dict[str, _Scale] = {}  # noqa: RUF012 (as above)
+    points: dict[str, _Scale] = {}
 
     def __post_init__(self) -> None:
         if not 0 < len(self.confidence) == len(self.sigma):
