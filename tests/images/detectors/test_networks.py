@@ -19,6 +19,7 @@ from kinefit.errors import FileError, ObservationError, PluginError
 from kinefit.images.detectors.detection import Follower, detect_people
 from kinefit.images.detectors.layouts import BLAZEPOSE, PointLayout
 from kinefit.images.detectors.networks import CropInput, TopDownModels
+from kinefit.observations import Detections
 from kinefit.readers.landmarks.keypoint_sets import KEYPOINT_SETS
 from kinefit.readers.landmarks.networks import (
     NETWORKS,
@@ -275,3 +276,57 @@ def test_a_plug_in_reads_files_of_its_own(tmp_path, monkeypatch):
     assert found is layout and find(None) == (tmp_path / "own.pt", 1)
     assert read_description(tmp_path / "own.pt").points is None and len(COLOURS) == 19
     assert issubclass(PluginError, Exception)
+
+
+def test_hands_and_faces_are_looked_for_by_the_points_that_a_network_has():
+    from kinefit.images.detectors.faces import around_head, around_wrist
+
+    layout = PointLayout("COCO_17", KEYPOINT_SETS["COCO_17"], (192, 256))
+    points = np.zeros((17, 2))
+    of = {name: k for k, name in enumerate(layout.names)}
+    points[[of["LElbow"], of["LWrist"]]] = (100.0, 100.0), (200.0, 100.0)
+    points[[of["LShoulder"], of["RShoulder"]]] = (140.0, 160.0), (60.0, 160.0)
+    head = [of[name] for name in ("Nose", "LEye", "REye", "LEar", "REar")]
+    points[head] = (100, 50), (108, 42), (92, 42), (118, 46), (82, 46)
+    hand, face = around_wrist(points, 0, layout), around_head(points, layout)
+    assert hand.centre[0] > 210 and hand.centre[1] == pytest.approx(100) and hand.turn == pytest.approx(np.pi / 2)
+    assert np.linalg.norm(face.centre - [100, 46]) < 5 and face.turn == pytest.approx(0.0)
+    few = PointLayout("", ("r_heel", "l_heel"), (192, 256))
+    assert around_head(points[:2], few) is None and few.mirror == [1, 0] and few.head == [0, 1]
+
+
+@pytest.mark.parametrize(("name", "whole"), [
+    ("COCO_17", "COCO_WHOLEBODY_133"), ("HALPE_26", "COCO_WHOLEBODY_133"), ("BODY_25", "BODY_25_HANDS"),
+    ("MEDIAPIPE_33", "MEDIAPIPE_75"),
+])  # fmt: skip
+def test_hands_join_the_set_that_has_them(name, whole):
+    K = len(KEYPOINT_SETS[name])
+    hands = np.arange(2 * 2 * 21 * 2, dtype=float).reshape(2, 1, 2, 21, 2)
+    found = Detections(
+        "c", 10.0, (640, 480), np.full((2, 1, K, 2), 50.0), np.ones((2, 1, K)), np.zeros(0, np.uint32),
+        np.zeros(3, int), hands=hands, hand_confidence=np.ones((2, 1, 2, 21)), keypoint_set=name,
+        names=KEYPOINT_SETS[name],
+    )  # fmt: skip
+    keypoints = found.keypoints()
+    assert keypoints.keypoint_set == whole and len(keypoints.names) == K + 42 == keypoints.points.shape[2]
+    right_wrist = "right_hand_wrist" if name == "MEDIAPIPE_33" else "RHandWrist"
+    at = keypoints.names.index(right_wrist)
+    assert set(keypoints.names[K:]) <= set(KEYPOINT_SETS[whole])
+    np.testing.assert_array_equal(keypoints.points[1, 0, at], hands[1, 0, 1, 0])
+
+
+def test_names_of_no_set_are_landmarks_of_the_body():
+    from kinefit.bodies import load_body
+    from kinefit.sensors.channels import make_channels
+    from kinefit.simulation import studio_rig
+
+    rig, body, names = studio_rig(cameras=2), load_body("humanoid"), ("r_heel", "l_heel")
+    records = [
+        Detections(
+            camera, 10.0, (640, 480), np.full((2, 1, 2, 2), 50.0), np.ones((2, 1, 2)), np.zeros(0, np.uint32),
+            np.zeros(3, int), keypoint_set="", names=names,
+        ).keypoints()
+        for camera in rig.names
+    ]  # fmt: skip
+    channels = make_channels(body, rig, records, [8.0, 8.0])
+    assert channels.points.names == names and channels.uv.shape == (2, 4, 2)
