@@ -1,1 +1,0 @@
-"""Benchmarks of networks of a user's own."""
