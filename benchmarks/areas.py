@@ -19,6 +19,10 @@ AREAS: dict[str, dict[str, str]] = {
         "channels": "what is found of the errors of markers and of a range sensor",
         "posture": "hips, spine and pelvis: what the posture prior tells",
     },
+    "networks": {
+        "networks_decode": "points of ONNX networks beside the published decoding; cost beside the network's own run",
+        "networks_sigma": "standard deviations by confidence, in cameras that were held out",
+    },
     "depth": {
         "depth_surfaces": "closest points on tapered elliptical cylinders",
         "depth_rendering": "drawing a body, and what depth sensors would have seen",

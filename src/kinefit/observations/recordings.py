@@ -124,6 +124,8 @@ class Keypoints:
         3D landmarks of a network, see `LiftedFrame`; NaN for undetected ones.
     sides_known : (F,) bool, optional
         Frames whose left and right are stated: no correction of swapped sides exchanges them.
+    sigma : float [px], optional
+        Standard deviation of a keypoint of confidence 1, where the detector was calibrated.
 
     Raises
     ------
@@ -142,6 +144,7 @@ class Keypoints:
     source: str = ""
     lifted: NDArray | None = None
     sides_known: NDArray | None = None
+    sigma: float | None = None
 
     def __post_init__(self) -> None:
         check_seen(self.camera, self.rate, self.names)

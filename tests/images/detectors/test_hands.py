@@ -16,6 +16,7 @@ from kinefit.images.detectors.faces import (
     around_hand,
     around_wrist,
 )
+from kinefit.images.detectors.layouts import BLAZEPOSE
 from kinefit.images.detectors.roi import Roi
 from kinefit.readers import assets
 from kinefit.readers.videos.video import Video
@@ -105,6 +106,8 @@ def test_hands_alone_are_found_by_their_palms_and_followed_without():
 
 
 class Nobody:
+    layout = BLAZEPOSE
+
     def find_people(self, image):
         return []
 

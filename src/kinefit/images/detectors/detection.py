@@ -10,17 +10,24 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.images.detectors.box_detector import DetectedPerson, Models
-from kinefit.images.detectors.roi import MIN_MASK, SIZE, Roi, Steady, cover, mask_runs, moved_mask, without_others
+from kinefit.images.detectors.networks import TopDownModels
+from kinefit.images.detectors.roi import (
+    MIN_MASK,
+    Roi,
+    Steady,
+    cover,
+    extent_mask,
+    mask_runs,
+    moved_mask,
+    without_others,
+)
 from kinefit.observations import Detections
 
-_MIN_PROBABILITY = 0.5  # of a person in a region
-_MIN_VISIBILITY = 0.65  # mean confidence of landmarks inside the image: people 0.71 and more, a pile of boxes 0.62
-_MIN_SEARCH_PROBABILITY = 0.9  # of detections from the tiled search
-_MIN_SEARCH_VISIBILITY = 0.75  # of detections from the tiled search: small people 0.78, machines 0.71
 _MAX_MASK_OVERLAP = 0.5  # share of a new person's mask that a tracked person may cover
 _MAX_DUPLICATE_DISTANCE = 0.05  # [sides of the region] median over the head, or all landmarks, of one person
 _MAX_RETURN_DISTANCE = 0.3  # [sides of the region] of the head from where the person was lost
@@ -28,7 +35,6 @@ _MIN_FRAMES = 3  # that a person must be detected in; fewer are a false positive
 _MIN_DURATION = 0.2  # [s] the same
 _MIN_ROI_PX = 16  # smaller regions show too little to recognise a person
 _MAX_ROI_SIDES = 8  # of the image; larger regions show too little as well
-_HEAD = slice(0, 11)  # the landmarks of the face
 _SEARCH_INTERVAL = 0.5  # [s] between searches of the whole image
 _LOST_INTERVAL = 0.1  # [s] the same, while a person is lost
 _MAX_TIME_LOST = 2.0  # [s] for which a lost person keeps the column
@@ -40,24 +46,24 @@ class _DetectionTrack:
 
     column: int
     steady: Steady
-    points: NDArray | None = None  # (33, 2) [px]
+    points: NDArray | None = None  # (K, 2) [px]
     last: int = -1  # frame
     shape: tuple[Roi, NDArray] | None = None  # last region, and the mask in it
 
 
 @dataclass(frozen=True, eq=False)
 class PersonDetection:
-    """One person in one image: column, landmarks (33, 2) [px], confidence (33,), runs of the mask, lifted (33, 3) [m].
+    """One person in one image: column, landmarks (K, 2) [px], confidence (K,), runs of the mask, lifted (K, 3) [m].
 
-    hands: points (2, 21, 2) [px] and confidence (2, 21) of the left and the right hand; face: points (478, 2) [px] and
-    confidence (478,); None unless they were looked for.
+    lifted: None where the network gives none. hands: points (2, 21, 2) [px] and confidence (2, 21) of the left and the
+    right hand; face: points (478, 2) [px] and confidence (478,); None unless they were looked for.
     """
 
     column: int
     points: NDArray
     confidence: NDArray
     runs: NDArray
-    lifted: NDArray
+    lifted: NDArray | None
     hands: tuple[NDArray, NDArray] | None = None
     face: tuple[NDArray, NDArray] | None = None
 
@@ -71,15 +77,15 @@ class Follower:
 
     Parameters
     ----------
-    models : Models
+    models : Models or TopDownModels
     rate : float [Hz]
     people : int
         Largest number of people at a time.
     masks : bool
-        Whether masks are computed.
+        Whether masks are computed, by networks that give them.
     """
 
-    models: Models
+    models: Models | TopDownModels
     rate: float
     people: int = 3
     masks: bool = True
@@ -118,7 +124,7 @@ class Follower:
                 continue
             assert track.points is not None
             moved = float(np.median(np.linalg.norm(found[1].points - track.points, axis=1)))
-            duplicate = next((k for k, s in enumerate(detected) if _is_same(s[0], found[0])), None)
+            duplicate = next((k for k, s in enumerate(detected) if self._is_same(s[0], found[0])), None)
             if duplicate is None:
                 detected.append((*found, moved))
                 continue
@@ -154,49 +160,71 @@ class Follower:
         searched: bool = False,
     ) -> tuple[_DetectionTrack, PersonDetection] | None:
         """The first new person that the landmark network confirms twice. The tiled search needs higher scores."""
-        score = _MIN_SEARCH_PROBABILITY if searched else _MIN_PROBABILITY
-        visibility = _MIN_SEARCH_VISIBILITY if searched else _MIN_VISIBILITY
+        layout = self.models.layout
+        score, visibility = layout.search_limits if searched else layout.limits
         for person in people:
             first = self._look_at(image, _DetectionTrack(-1, Steady.at(person.points)), score, mask=False)
             new = first and self._look_at(image, first[0], score, mask=self.masks or self.people > 1)
-            if new and _mean_visibility(new[1], image) >= visibility and not any(_is_tracked(new[0], t) for t in known):
-                return new
+            if new and _mean_visibility(new[1], image) >= visibility:
+                if not any(self._is_tracked(new[0], t) for t in known):
+                    return new
         return None
 
     def _column_of(self, new: _DetectionTrack) -> int:
         """Column of the nearest lost person, if close enough; else a new column."""
-        lost = min(self._lost, key=lambda t: _distance(t, new, _HEAD), default=None)
-        if lost is not None and _distance(lost, new, _HEAD) < _MAX_RETURN_DISTANCE:
+        head = self.models.layout.head
+        lost = min(self._lost, key=lambda t: _distance(t, new, head), default=None)
+        if lost is not None and _distance(lost, new, head) < _MAX_RETURN_DISTANCE:
             self._lost.remove(lost)
             return lost.column
         self._columns += 1
         return self._columns - 1
 
     def _look_at(
-        self, image: NDArray[np.uint8], track: _DetectionTrack, score: float = _MIN_PROBABILITY, *,
-        mask: bool, others: Sequence[tuple[Roi, NDArray]] = (),
+        self, image: NDArray[np.uint8], track: _DetectionTrack, score: float | None = None, *, mask: bool,
+        others: Sequence[tuple[Roi, NDArray]] = (),
     ) -> tuple[_DetectionTrack, PersonDetection] | None:  # fmt: skip
         """Detect a person's landmarks in the predicted region; None where there is no person.
 
-        The last masks of other people in the region are painted over: they attract the person's landmarks.
+        The last masks of other people in the region are painted over: they attract the person's landmarks. Where the
+        network gives no masks, the extent of the points stands for one, which only finds other people and duplicates.
         """
-        roi = track.steady.roi
+        roi, layout = track.steady.roi, self.models.layout
         if not _MIN_ROI_PX < roi.side < _MAX_ROI_SIDES * max(image.shape[:2]):
             return None
-        pose = self.models.pose(without_others(roi.crop(image, SIZE), roi, track.shape, others), mask=mask)
-        if pose.score < score:
+        if layout.has_masks:
+            crop = without_others(roi.crop(image, layout.size), roi, track.shape, others)
+        else:
+            crop = roi.crop(image, layout.size, cv2.BORDER_CONSTANT)
+        pose = self.models.pose(crop, mask=mask)
+        if pose.score < (layout.limits[0] if score is None else score):
             return None
-        points = roi.to_image(pose.points, SIZE)
-        ends = roi.to_image(np.stack([pose.middle, pose.rim]), SIZE)
+        points = roi.to_image(pose.points, layout.size)
+        ends = roi.to_image(np.stack([pose.middle, pose.rim]), layout.size)
         steady = track.steady.follow(ends) if track.points is not None else Steady.at(ends)
         runs = np.zeros(0, np.uint32)
         if self.masks and pose.mask is not None:
             runs = mask_runs(pose.mask, roi, image.shape[:2])
-        sighting = PersonDetection(
-            track.column, points, pose.visibility * pose.presence, runs, roi.to_upright(pose.lifted)
-        )
-        shape = None if pose.mask is None else (roi, pose.mask)
+        confidence = pose.visibility * pose.presence
+        lifted = None if pose.lifted is None else roi.to_upright(pose.lifted)
+        extent = pose.mask
+        if not layout.has_masks:
+            extent = extent_mask(pose.points[confidence >= layout.limits[1]], layout.size)
+        shape = None if extent is None else (roi, extent)
+        sighting = PersonDetection(track.column, points, confidence, runs, lifted)
         return replace(track, steady=steady, points=points, last=self._frame, shape=shape), sighting
+
+    def _is_same(self, a: _DetectionTrack, b: _DetectionTrack) -> bool:
+        head, everything = self.models.layout.head, slice(None)
+        return min(_distance(a, b, head), _distance(a, b, everything)) < _MAX_DUPLICATE_DISTANCE
+
+    def _is_tracked(self, new: _DetectionTrack, known: _DetectionTrack) -> bool:
+        """Whether a new detection is a tracked person: most of its mask lies in theirs, or the landmarks agree."""
+        assert new.shape and known.shape
+        (roi, mask), (other_roi, other) = new.shape, known.shape
+        moved = moved_mask((roi, mask), other_roi) > 0
+        area = float((mask > MIN_MASK).sum()) * (roi.side / other_roi.side) ** 2
+        return bool((moved & (other > MIN_MASK)).sum() > _MAX_MASK_OVERLAP * area) or self._is_same(new, known)
 
 
 def _mean_visibility(detected: PersonDetection, image: NDArray) -> float:
@@ -205,20 +233,7 @@ def _mean_visibility(detected: PersonDetection, image: NDArray) -> float:
     return float(detected.confidence[inside].mean()) if inside.any() else 0.0
 
 
-def _is_same(a: _DetectionTrack, b: _DetectionTrack) -> bool:
-    return min(_distance(a, b, _HEAD), _distance(a, b, slice(None))) < _MAX_DUPLICATE_DISTANCE
-
-
-def _is_tracked(new: _DetectionTrack, known: _DetectionTrack) -> bool:
-    """Whether a new detection is a tracked person: most of its mask lies in theirs, or the landmarks agree."""
-    assert new.shape and known.shape
-    (roi, mask), (other_roi, other) = new.shape, known.shape
-    moved = moved_mask((roi, mask), other_roi) > 0
-    area = float((mask > MIN_MASK).sum()) * (roi.side / other_roi.side) ** 2
-    return bool((moved & (other > MIN_MASK)).sum() > _MAX_MASK_OVERLAP * area) or _is_same(new, known)
-
-
-def _distance(a: _DetectionTrack, b: _DetectionTrack, points: slice) -> float:
+def _distance(a: _DetectionTrack, b: _DetectionTrack, points: slice | list[int]) -> float:
     """Median distance of selected landmarks, in sides of the smaller region."""
     assert a.points is not None and b.points is not None
     side = min(a.steady.roi.side, b.steady.roi.side)
@@ -226,7 +241,7 @@ def _distance(a: _DetectionTrack, b: _DetectionTrack, points: slice) -> float:
 
 
 def detect_people(
-    images: Iterable[NDArray[np.uint8]], models: Models, *, camera: str, rate: float, people: int = 3,
+    images: Iterable[NDArray[np.uint8]], models: Models | TopDownModels, *, camera: str, rate: float, people: int = 3,
     masks: bool = True, with_hands: _Adder | None = None, with_faces: _Adder | None = None,
 ) -> Detections:  # fmt: skip
     """Detect and track people in a video: keypoints and masks.
@@ -234,13 +249,13 @@ def detect_people(
     Parameters
     ----------
     images : (H, W, 3) uint8 RGB each, upright, in order.
-    models : Models
+    models : Models or TopDownModels
     camera : str
     rate : float [Hz]
     people : int
         Largest number of people at a time.
     masks : bool
-        Whether masks are computed.
+        Whether masks are computed, by networks that give them.
     with_hands, with_faces : callable, optional
         Adds hands, or faces, to the people in an image: a `HandFollower`, a `FaceFinder`.
 
@@ -262,21 +277,24 @@ def detect_people(
     times = Counter(s.column for frame in frames for s in frame)
     least = min(max(_MIN_FRAMES, round(_MIN_DURATION * rate)), len(frames) // 2)
     column = {c: k for k, c in enumerate(sorted(c for c in times if times[c] >= least))}
-    points = np.full((len(frames), len(column), 33, 2), np.nan)
-    confidence = np.zeros((len(frames), len(column), 33))
+    layout = models.layout
+    confidence = np.zeros((len(frames), len(column), len(layout.names)))
+    points, lifted = (np.full((*confidence.shape, axes), np.nan) for axes in (2, 3))
     counts = np.zeros((len(frames), len(column)), int)
-    lifted = np.full((len(frames), len(column), 33, 3), np.nan)
     runs = [np.zeros(0, np.uint32)]
     for f, frame in enumerate(frames):
         for s in sorted((s for s in frame if s.column in column), key=lambda s: s.column):
             at = f, column[s.column]
-            points[at], confidence[at], counts[at], lifted[at] = s.points, s.confidence, len(s.runs), s.lifted
+            points[at], confidence[at], counts[at] = s.points, s.confidence, len(s.runs)
+            if s.lifted is not None:
+                lifted[at] = s.lifted
             runs.append(s.runs)
     hands, hand_confidence = _stacked(frames, column, "hands", (2, 21)) if with_hands else (None, None)
     face, face_confidence = _stacked(frames, column, "face", (478,)) if with_faces else (None, None)
     return Detections(
         camera, rate, size, points, confidence, np.concatenate(runs), np.concatenate([[0], np.cumsum(counts)]), "",
-        lifted, hands, hand_confidence, None, face, face_confidence,
+        lifted if layout.has_masks else None, hands, hand_confidence, None, face, face_confidence,
+        layout.keypoint_set, layout.names,
     )
 
 

@@ -14,6 +14,7 @@ from kinefit._mapped import kept
 from kinefit.errors import ObservationError, check_choice, shortened
 from kinefit.observations import MEDIAPIPE_33, MEDIAPIPE_75, MEDIAPIPE_478, Keypoints
 from kinefit.observations.arrays import sealed
+from kinefit.observations.detections import OPENPOSE_HAND_42
 from kinefit.observations.recordings import check_pixels, confidence_of
 
 if TYPE_CHECKING:
@@ -24,11 +25,6 @@ _FACE_ARMS_LEGS = (
 )
 
 _FEET = "LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel"
-_FINGERS = "Thumb Index Middle Ring Little"
-_HANDS = tuple(
-    f"{side}Hand{point}" for side in "LR"
-    for point in ("Wrist", *(f"{finger}{k}" for finger in _FINGERS.split() for k in range(1, 5)))
-)  # fmt: skip
 _BODY_25 = tuple(
     "Nose Neck RShoulder RElbow RWrist LShoulder LElbow LWrist MidHip RHip RKnee RAnkle LHip LKnee LAnkle "
     "REye LEye REar LEar LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel".split()
@@ -40,11 +36,11 @@ KEYPOINT_SETS: dict[str, tuple[str, ...]] = {
         "UpperNeck", "HeadTop", *_FEET.split(),
     ),
     "BODY_25": _BODY_25,
-    "BODY_25_HANDS": (*_BODY_25, *_HANDS),
+    "BODY_25_HANDS": (*_BODY_25, *OPENPOSE_HAND_42),
     "COCO_17": tuple(_FACE_ARMS_LEGS.split()),
     "COCO_18": tuple(name for name in _BODY_25[:19] if name != "MidHip"),
     "COCO_WHOLEBODY_133": (
-        *_FACE_ARMS_LEGS.split(), *_FEET.split(), *(f"Face{k}" for k in range(68)), *_HANDS,
+        *_FACE_ARMS_LEGS.split(), *_FEET.split(), *(f"Face{k}" for k in range(68)), *OPENPOSE_HAND_42,
     ),
     "HALPE_26": (
         *_FACE_ARMS_LEGS.split(),
