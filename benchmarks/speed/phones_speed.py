@@ -8,14 +8,13 @@ moves no more than in the recording.
 from __future__ import annotations
 
 import resource
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import av
 
+from benchmarks.commands import ended
 from benchmarks.figures import figure, whole_recording
 from kinefit.readers.videos.video import Video
 
@@ -33,8 +32,7 @@ def run() -> None:
         spent = {}
         for step in (["init", "."], ["detect", "take.toml"], ["track", "take.toml"]):
             since = time.perf_counter()
-            command = [sys.executable, "-m", "kinefit", *step]
-            subprocess.run(command, cwd=folder, check=True, capture_output=True)
+            ended(*step, cwd=folder, check=True)
             spent[step[0]] = time.perf_counter() - since
         whole = 4.0 * _SECONDS
         print("# " + ", ".join(f"{name} {seconds:.0f} s" for name, seconds in spent.items()))

@@ -8,8 +8,6 @@ seconds no camera sees the left hand. Settings were chosen on seeds 0 to 3; prin
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -18,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.commands import ended
 from benchmarks.figures import FAILED, amount, figure
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, read_motion, track
 from kinefit.bodies import Body
@@ -133,8 +132,7 @@ def tracked(rig: Rig, seen: list[Keypoints], folder: Path, body: str = "humanoid
         np.save(folder / (file := f"{one.camera}_{one.keypoint_set}.npy"), np.nan_to_num(values))
         lines += [f'[[keypoints]]\ncamera = "{one.camera}"\nfile = "{file}"\nformat = "mediapipe"\n']
     (folder / "take.toml").write_text("\n".join(lines))
-    command = [sys.executable, "-m", "kinefit", "track", str(folder / "take.toml"), "-o", str(folder / "out")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    done = ended("track", folder / "take.toml", "-o", folder / "out", timeout=600)
     if done.returncode:
         FAILED.append(f"track {body}")
         raise RuntimeError(done.stderr[-2000:])

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from click.testing import CliRunner
 from numpy.typing import NDArray
 
+from benchmarks.commands import printed
 from benchmarks.figures import amount, figure, recording
 from benchmarks.scenes.regions_scene import away, rigid, state_of
 from kinefit.bodies import Body
@@ -103,14 +103,9 @@ def run() -> None:
 
 def tracked(folder: Path, true: NDArray, every: int, *options: str) -> tuple[Motion, NDArray]:
     """The motion of every so many images by the command, and its errors (F, 2) [mm], [deg] after the first."""
-    from kinefit.cli import main
-
     with tempfile.TemporaryDirectory() as work:
         path = take_of(folder, Path(work), true[0], every)
-        words = ["track", str(path), "-o", f"{work}/result", "--formats", "motion", *options]
-        told = CliRunner().invoke(main, words)
-        if told.exit_code:
-            raise RuntimeError(told.output)
+        printed("track", path, "-o", f"{work}/result", "--formats", "motion", *options)
         motion = read_motion(Path(work) / "result" / "motion.npz")
     return motion, np.array([away(T, t) for T, t in zip(motion.Ts_world_root[1:], true[every::every])])
 

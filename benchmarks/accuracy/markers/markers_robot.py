@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from click.testing import CliRunner
 from numpy.typing import NDArray
 
+from benchmarks.commands import printed
 from benchmarks.figures import amount, figure
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.exporters import write_markers
@@ -107,7 +107,7 @@ def learn(robot: Robot, folder: Path, seed: int) -> Path:
     rng = np.random.default_rng([seed, 1])
     angles = smooth_angles(robot, 3, rng)
     write_markers(Markers(robot.labels, RATE, positions(robot, angles, rng), up="y"), folder / "labelled.c3d")
-    command("markers", "learn", folder / "labelled.c3d", "--frame", 0, "--set", robot.set_file, "--name", "robot",
+    printed("markers", "learn", folder / "labelled.c3d", "--frame", 0, "--set", robot.set_file, "--name", "robot",
             "-o", folder / "robot.json")  # fmt: skip
     return folder / "robot.json"
 
@@ -155,20 +155,10 @@ def broken_take(robot: Robot, folder: Path, frames: int, seed: int) -> tuple[NDA
     return angles, x, seen
 
 
-def command(*words: object) -> str:
-    """A command of kinefit; what it said."""
-    from kinefit.cli import main
-
-    told = CliRunner().invoke(main, [str(word) for word in words])
-    if told.exit_code:
-        raise RuntimeError(told.output)
-    return told.output
-
-
 def whole_take(robot: Robot, model: Path, folder: Path, frames: int, seed: int) -> dict[str, float]:
     """Shares [%] named and wrong of a take by `identify`; by `track`, errors of angles [deg] and of the tool [mm]."""
     angles, x, seen = broken_take(robot, folder, frames, seed)
-    command("markers", "identify", folder / "points.c3d", model, "--no-fill")
+    printed("markers", "identify", folder / "points.c3d", model, "--no-fill")
     named = read_markers(folder / "points-named.c3d")
     found = named.positions[:, [named.names.index(label) for label in robot.labels]]
     there = np.isfinite(found).all(axis=2)
@@ -177,7 +167,7 @@ def whole_take(robot: Robot, model: Path, folder: Path, frames: int, seed: int) 
         '[take]\nbody = "robot.toml"\nup = "y"\nsize = false\n[[markers]]\nfile = "points.c3d"\nset = "ROBOT"\n'
         'model = "robot.json"\nsigma = 0.001\n'
     )
-    command("track", folder / "take.toml", "-o", folder / "result", "--formats", "motion")
+    printed("track", folder / "take.toml", "-o", folder / "result", "--formats", "motion")
     motion = read_motion(folder / "result" / "motion.npz")
     off = np.degrees(motion.angles - angles[: len(motion)])
     tool = robot.body.tree.segment("tool")

@@ -15,8 +15,6 @@ the starts of the depth camera were: figures are of draws 5 and on.
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,6 +25,7 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy.mixed import mixed_takes as takes
 from benchmarks.accuracy.mixed.mixed_takes import CAMERAS, RATE, SENSOR
+from benchmarks.commands import ended
 from benchmarks.figures import figure
 from kinefit import Motion, load_body
 from kinefit.bodies import Body
@@ -121,7 +120,7 @@ def record(draw: int, shape: str, seconds: float = SECONDS) -> Walk:
     gone = replace(around, motion=replace(truth, Ts_world_root=T))
     empty = takes._counts(simulate_depth(gone.motion, front, SENSOR, seed=draw + 10_000, scene=gone), takes.EMPTY)
     keypoints = takes.detected(truth, rig, draw, cameras=CAMERAS[:2])
-    return Walk(truth, rig, told, keypoints, depth, empty, takes._markers(truth, random))
+    return Walk(truth, rig, told, keypoints, depth, empty, takes.marked(truth, random))
 
 
 def misfit(draw: int, sensor: str, centre: NDArray) -> NDArray:
@@ -184,8 +183,8 @@ def placed(walk: Walk, sensor: str, rig: Rig, draw: int, wrong: Sequence[str], f
 
 def checked(folder: Path) -> tuple[bool, str]:
     """Whether the command found a fault, and its text."""
-    command = [sys.executable, "-m", "kinefit", "check", "take.toml", "--strict", "--refine", "--take", "-o", "p.html"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=900)
+    words = ["check", "take.toml", "--strict", "--refine", "--take", "-o", "p.html"]
+    done = ended(*words, cwd=folder, timeout=900)
     told = done.stdout + done.stderr
     if done.returncode not in (0, FAULT) or "Traceback" in told:
         raise RuntimeError(f"kinefit check: {(told.strip().splitlines() or ['no message'])[-1]}")

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Mapping
@@ -23,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.commands import ended
 from benchmarks.figures import NotMeasured, data, figure, quick
 from kinefit import Motion, load_body, read_motion
 from kinefit.errors import AssetError, ObservationError
@@ -82,15 +81,15 @@ def _of_trial(markers: Path, folder: Path, trial: str) -> Mapping[str, float]:
     times, truth = _joints_of_file(markers / "sample_mocap.json")
     rival = _against(*_joints_of_file(markers / "sample_mono.json"), times, truth)
     stature = _stature(truth)
-    _kinefit("init", str(folder))
+    ended("init", folder, check=True)
     take = folder / "take.toml"
     take.write_text(take.read_text().replace("# height = 1.75", f"height = {stature:.2f}  #"))
     began = time.perf_counter()
-    _kinefit("track", str(take))
+    ended("track", take, check=True)
     took = time.perf_counter() - began
     motion = read_motion(folder / "take-kinefit" / "motion.npz")
     take.write_text(take.read_text().replace("height = ", "# height = "))
-    _kinefit("track", str(take), "--pictures", "none", "--no-report")
+    ended("track", take, "--pictures", "none", "--no-report", check=True)
     without = read_motion(folder / "take-kinefit" / "motion.npz")
     scale = json.loads((markers / "sample_mocap.json").read_text())["bodies"]["pelvis"]["scaleFactors"][0]
     ours = _against(motion.times, _joints_of(motion, scale), times, truth, _std_of(motion))
@@ -118,7 +117,7 @@ def _balancing() -> None:
         together.mkdir()
         for file in (*(root / "videos").glob("*.mp4"), root / "Calib_refined_static.toml"):
             shutil.copy(file, together)
-        _kinefit("init", str(together))
+        ended("init", together, check=True)
         truth = _tracked(together / "take.toml")
         x = _joints_of(truth, 1.0)
         for video in sorted(together.glob("*.mp4")):
@@ -126,7 +125,7 @@ def _balancing() -> None:
             (folder / "take-detect").mkdir(parents=True)
             shutil.copy(video, folder)
             shutil.copy(together / "take-detect" / f"{video.stem}.npz", folder / "take-detect")
-            _kinefit("init", str(folder))
+            ended("init", folder, check=True)
             take = folder / "take.toml"
             take.write_text(take.read_text().replace("# height = 1.75", f"height = {truth.body.stature:.2f}  #"))
             motion = _tracked(take)
@@ -137,14 +136,8 @@ def _balancing() -> None:
 
 
 def _tracked(take: Path) -> Motion:
-    _kinefit("track", str(take), "--person", "first", "--pictures", "none", "--no-report")
+    ended("track", take, "--person", "first", "--pictures", "none", "--no-report", check=True)
     return read_motion(take.with_name("take-kinefit") / "motion.npz")
-
-
-def _kinefit(*words: str) -> None:
-    done = subprocess.run([sys.executable, "-m", "kinefit", *words], capture_output=True, text=True)
-    if done.returncode:
-        raise RuntimeError(done.stderr)
 
 
 def _joints_of_file(path: Path) -> tuple[NDArray, NDArray]:

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from click.testing import CliRunner
 from numpy.typing import NDArray
 
+from benchmarks.commands import printed
 from benchmarks.figures import amount, figure
 from benchmarks.scenes.textured import textured_picture
 from kinefit.bodies import BodyState, load_body
@@ -98,18 +98,11 @@ def errors(folder: Path, seed: int, *, frames: int, size: int) -> dict[str, floa
     """RMS errors [deg] of the elbow's and wrist's angles, also without their means and in stated standard deviations,
     and of the upper arm's turn.
     """
-    from kinefit.cli import main
-
     motion, rig = moving_arm(seed, frames), cameras(size)
     record(folder, motion, rig, seed)
     views = [f"{camera.name}={folder / camera.name}.avi" for camera in rig]
-    for words in (
-        ["surface", str(folder / "calib.toml"), *views, "-o", str(folder / "surface")],
-        ["track", str(folder / "take.toml"), "-o", str(folder / "result")],
-    ):
-        told = CliRunner().invoke(main, words)
-        if told.exit_code:
-            raise RuntimeError(told.output)
+    printed("surface", folder / "calib.toml", *views, "-o", folder / "surface")
+    printed("track", folder / "take.toml", "-o", folder / "result")
     print(f"  {len((folder / 'surface' / 'trajectories.csv').read_text().splitlines()) - 1} places of points")
     found = read_motion(folder / "result" / "motion.npz")
     names = motion.body.tree.coordinates

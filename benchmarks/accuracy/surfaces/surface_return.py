@@ -15,10 +15,10 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from click.testing import CliRunner
 from numpy.typing import NDArray
 
 from benchmarks.accuracy.surfaces.surface_body import cameras, frames_of, moving_arm, record
+from benchmarks.commands import printed
 from benchmarks.figures import amount, figure
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.surfaces.places import nearest
@@ -52,19 +52,12 @@ def counts(
     folder: Path, seed: int, *, frames: int, size: int
 ) -> tuple[tuple[int, int, int, int], list[float]]:
     """Found again without the motion; that could be, that were, that were wrong, with it; and how late, in frames."""
-    from kinefit.cli import main
-
     motion, rig = moving_arm(seed, frames), cameras(size)
     record(folder, motion, rig, seed)
-    surface = ["surface", str(folder / "calib.toml"), *(f"{c.name}={folder / c.name}.avi" for c in rig)]
-    for words in (
-        [*surface, "-o", str(folder / "surface")],
-        ["track", str(folder / "take.toml"), "-o", str(folder / "result")],
-        [*surface, "-o", str(folder / "again"), "--motion", str(folder / "result")],
-    ):
-        told = CliRunner().invoke(main, words)
-        if told.exit_code:
-            raise RuntimeError(told.output)
+    surface = ["surface", folder / "calib.toml", *(f"{c.name}={folder / c.name}.avi" for c in rig)]
+    printed(*surface, "-o", folder / "surface")
+    printed("track", folder / "take.toml", "-o", folder / "result")
+    printed(*surface, "-o", folder / "again", "--motion", folder / "result")
     without = returns(paths_of(folder / "surface" / "trajectories.csv", motion), motion, rig)
     paths = paths_of(folder / "again" / "trajectories.csv", motion)
     late = lateness(folder / "again" / "returns.csv", paths, motion, rig)

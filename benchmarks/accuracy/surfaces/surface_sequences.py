@@ -22,7 +22,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from click.testing import CliRunner
 from numpy.typing import NDArray
 
 from benchmarks.accuracy.mixed.mixed_real import take_text
@@ -35,6 +34,7 @@ from benchmarks.accuracy.surfaces.stereo_cylinder import (
     calibration_object,
 )
 from benchmarks.accuracy.surfaces.stereo_cylinder import SIZE as CYLINDER_SIZE
+from benchmarks.commands import printed
 from benchmarks.figures import amount, data, figure
 from kinefit.geometry.camera import Rig
 from kinefit.images.photogrammetry.least_squares_matching import Grid, match
@@ -101,16 +101,6 @@ def run() -> None:
             _spheres(work, place)
 
 
-def _call(*words: object) -> str:
-    """What the command prints; raises RuntimeError if it ends with an error."""
-    from kinefit.cli import main
-
-    told = CliRunner().invoke(main, [str(word) for word in words])
-    if told.exit_code:
-        raise RuntimeError(told.output)
-    return told.output
-
-
 def _report(name: str, right: NDArray, live: NDArray, judged: NDArray) -> None:
     """Figures of places (N,): right, still there at the end, with a reference."""
     counts = {"right": live & judged & right, "said": ~live, "unsaid": live & judged & ~right}
@@ -172,7 +162,7 @@ def _challenge(work: Path) -> None:
     order = (0, 1, 2, 3, 2, 1, 0, 3)
     _write_video(work / "dic.avi", [images[k] for k in order])
     step = amount(12, 40)
-    _call("surface", work / "dic.avi", "--flat", 1, "--window", 21, "--step", step, "-o", work / "dic")
+    printed("surface", work / "dic.avi", "--flat", 1, "--window", 21, "--step", step, "-o", work / "dic")
     places = Grid.of(images[0].shape[1::-1], step, margin=12).points
     ids, x = _paths(work / "dic", len(order))
     end = _all(len(places), ids, _in_pixels(x[-1]))
@@ -203,7 +193,7 @@ def _cylinder(work: Path) -> None:
         _write_video(work / f"{name}.avi", photographs[name])
     views = [f"{name}={work / name}.avi" for name in CAMERAS]
     options = ["--mask", work / "mask.png", "--window", WINDOW, "--step", 24, "-o", work / "cylinder"]
-    _call("surface", work / "calib.toml", *views, *options)
+    printed("surface", work / "calib.toml", *views, *options)
     _, x = _paths(work / "cylinder", 3)
     begun = np.isfinite(x[0, :, 0])
     first, last = x[0, begun], x[-1, begun]
@@ -239,7 +229,7 @@ def _cloth(work: Path, name: str) -> None:
     _write_video(work / "cloth.avi", images)
     _mask(work / "mask.png", size, cloth.box)
     options = ["--flat", 1, "--window", SIDE, "--step", step, "--reach", 12, "--mask", work / "mask.png"]
-    _call("surface", work / "cloth.avi", *options, "-o", work / name)
+    printed("surface", work / "cloth.avi", *options, "-o", work / name)
     mask = cv2.imread(str(work / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0
     grid = Grid.of(size, step, margin=SIDE // 2 + 2, mask=mask)
     places = grid.points[grid.inside]
@@ -278,15 +268,15 @@ def _help(work: Path) -> None:
         return
     count = amount(40, 6)
     (work / "take.toml").write_text(take_text(folder, "openpose", False, frames=count))
-    _call("track", work / "take.toml", "-o", work / "motion")
+    printed("track", work / "take.toml", "-o", work / "motion")
     with Video(folder / "videos" / f"{camera}.mp4") as video:
         images = [video.read(k)[..., ::-1].copy() for k in range(count)]
     _write_video(work / "man.avi", images)
     _mask(work / "mask.png", images[0].shape[1::-1], box)
     options = ["--window", SIDE, "--step", 8, "--reach", 12, "--mask", work / "mask.png"]
     calibration = [folder / "Calib_refined_static.toml", f"{camera}={work / 'man.avi'}", "--unit", "m"]
-    _call("surface", *calibration, "--motion", work / "motion", *options, "-o", work / "on")
-    _call("surface", work / "man.avi", "--flat", 1, *options, "-o", work / "off")
+    printed("surface", *calibration, "--motion", work / "motion", *options, "-o", work / "on")
+    printed("surface", work / "man.avi", "--flat", 1, *options, "-o", work / "off")
     for name in ("off", "on"):
         live = np.isfinite(_paths(work / name, count)[1][..., 0]).sum(axis=1)
         print(f"# help {name}: {live[0]} points at first, {live[count // 2]} in the middle, {live[-1]} at the end")
@@ -350,7 +340,7 @@ def _spheres(work: Path, name: str) -> None:
         cv2.circle(mask, (u, v), 6, 255, -1)
     cv2.imwrite(str(work / "mask.png"), mask)
     options = ["--flat", 1, "--bright", diameter, "--reach", reach, "--mask", work / "mask.png"]
-    _call("surface", work / "spheres.avi", *options, "-o", work / name)
+    printed("surface", work / "spheres.avi", *options, "-o", work / name)
     uv = _in_pixels(_paths(work / name, len(images))[1])
     gaps = np.linalg.norm(uv[0][None] - table[:, None, :2], axis=2)
     gaps[:, ~np.isfinite(uv[-1, :, 0])] = np.inf

@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -18,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.commands import command, ended
 from benchmarks.figures import LEFT_OUT, NotMeasured, data, figure, quick
 from benchmarks.house.house_size import PACKAGE, code_lines
 
@@ -82,8 +82,8 @@ def chromium() -> Iterator[Any]:
 @contextmanager
 def running_app(folder: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """A running app, and its address."""
-    command = [sys.executable, "-m", "kinefit", "app", str(folder), "--port", "0", "--token", _TOKEN, "--no-browser"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    words = command("app", folder, "--port", 0, "--token", _TOKEN, "--no-browser")
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     assert process.stdout is not None
     try:
         found = re.search(r"http://\S+/", process.stdout.readline())
@@ -156,5 +156,5 @@ def _by_command(videos: list[Path]) -> float:
         for video in videos:
             shutil.copyfile(video, Path(work) / video.name)
         since = time.perf_counter()
-        subprocess.run([sys.executable, "-m", "kinefit", "track", work], check=True, capture_output=True)
+        ended("track", work, check=True)
         return time.perf_counter() - since

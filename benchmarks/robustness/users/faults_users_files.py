@@ -22,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import kinefit
+from benchmarks.commands import QUIET
+from benchmarks.commands import answer as command
 from benchmarks.figures import amount, data, figure
-from benchmarks.robustness.users.faults_users_pictures import QUIET, write_video
-from benchmarks.robustness.users.faults_users_pictures import run as command
+from benchmarks.robustness.users.faults_users_pictures import write_video
 from kinefit.errors import KinefitError
 from kinefit.readers.depth.recordings import read_clouds, read_depth
 from kinefit.readers.take.file import read_take

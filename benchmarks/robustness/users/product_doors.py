@@ -20,10 +20,11 @@ import cv2
 import numpy as np
 
 import kinefit
+from benchmarks.commands import QUIET
+from benchmarks.commands import answer as command
 from benchmarks.figures import amount, data, figure
 from benchmarks.robustness.users.faults_users_files import named_files, scene, videos, write_depth
-from benchmarks.robustness.users.faults_users_pictures import QUIET, write_video
-from benchmarks.robustness.users.faults_users_pictures import run as command
+from benchmarks.robustness.users.faults_users_pictures import write_video
 from kinefit.bodies.motion import Residuals
 from kinefit.exporters import write_markers
 from kinefit.exporters.report.report import write_report
