@@ -83,6 +83,7 @@ def _head() -> None:
     """A walking person before a simulated stereo head, 3 m away."""
     folder = recording("motion_cmu_bvh")
     from kinefit.readers.skeletons.bvh import read_bvh
+    from kinefit.simulation.figures import look_at
     from kinefit.simulation.rendering.scenes import STEREO, SimulatedScene, picture
     from kinefit.simulation.retarget import retarget
 
@@ -91,10 +92,7 @@ def _head() -> None:
     for frame in range(1, len(motion.angles), amount(2, 20)):
         aim = motion.Ts_world_root[frame][:3, 3]
         place = aim + (0.3, 0.2, 3.0)
-        z = (aim - place) / np.linalg.norm(aim - place)
-        x = np.cross(z, (0.0, 1.0, 0.0)) / np.linalg.norm(np.cross(z, (0.0, 1.0, 0.0)))
-        R = np.stack([x, np.cross(z, x), z])
-        left, right = STEREO.pair(STEREO.camera(se3.transform(R, -R @ place)))
+        left, right = STEREO.pair(STEREO.camera(look_at(place, aim, np.array([0.0, 1.0, 0.0]))))
         scene = SimulatedScene.of(motion, left)
         images = [picture(scene, frame, c, STEREO, grey=True) for c in (left, right)]
         pair = StereoRectifier(left, right, near=1.0, far=8.0)

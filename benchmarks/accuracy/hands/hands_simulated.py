@@ -24,6 +24,7 @@ from kinefit.geometry import se3
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.simulation.evaluation import angle_errors, joint_errors
+from kinefit.simulation.figures import look_at
 from kinefit.simulation.retarget import known_motion
 from kinefit.solving.bundle.shape import mirror_points
 
@@ -95,11 +96,9 @@ def near_rig(truth: Motion, landmarks: tuple[str, ...] = ("l_wrist", "r_wrist"))
     cameras = []
     for k, (camera, azimuth) in enumerate(zip(rig, np.radians((-55.0, -18.0, 20.0, 60.0)))):
         place = middle + 1.5 * np.array([np.cos(azimuth), 0.25 + 0.2 * (k % 2), np.sin(azimuth)])
-        z = (middle - place) / np.linalg.norm(middle - place)
-        x = np.cross(z, [0.0, 1.0, 0.0]) / np.linalg.norm(np.cross(z, [0.0, 1.0, 0.0]))
-        R = np.stack([x, np.cross(z, x), z])
+        T_camera_world = look_at(place, middle, np.array([0.0, 1.0, 0.0]))
         matrix = np.array([[1000.0, 0, 639.5], [0, 1000.0, 479.5], [0, 0, 1]])
-        cameras.append(replace(camera, matrix=matrix, T_camera_world=se3.transform(R, -R @ place)))
+        cameras.append(replace(camera, matrix=matrix, T_camera_world=T_camera_world))
     return Rig(tuple(cameras))
 
 

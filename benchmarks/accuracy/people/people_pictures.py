@@ -29,6 +29,7 @@ from kinefit.fitting.tracking.video import track
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import Keypoints
 from kinefit.simulation import simulate_keypoints
+from kinefit.simulation.figures import look_at
 from kinefit.simulation.movements import movement
 from kinefit.simulation.movements import people as persons
 
@@ -52,12 +53,7 @@ def _rig(away: float = 4.2) -> Rig:
     cameras = []
     for k, turn in enumerate(np.radians((25.0, 70.0, 110.0, 155.0))):
         eye = np.array([away * np.cos(turn), 1.5, away * np.sin(turn)])
-        z = np.array([0.2, 0.9, 0.0]) - eye
-        z /= np.linalg.norm(z)
-        x = np.cross(z, [0.0, 1.0, 0.0])
-        T = np.eye(4)
-        T[:3, :3] = np.stack([x / np.linalg.norm(x), np.cross(z, x) / np.linalg.norm(x), z])
-        T[:3, 3] = -T[:3, :3] @ eye
+        T = look_at(eye, np.array([0.2, 0.9, 0.0]), np.array([0.0, 1.0, 0.0]))
         matrix = np.array([[720.0, 0.0, 639.5], [0.0, 720.0, 479.5], [0.0, 0.0, 1.0]])
         cameras.append(Camera(f"cam{k + 1:02d}", (1280, 960), matrix, T_camera_world=T))
     return Rig(tuple(cameras))

@@ -31,6 +31,7 @@ from kinefit.images.photogrammetry.surface import measure, measure_states, surfa
 from kinefit.images.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
 from kinefit.images.photogrammetry.trajectories import Trajectories, uniform, within_bounds
 from kinefit.readers.videos.video import Video
+from kinefit.simulation.figures import look_at
 
 RADIUS, SIZE, SEED = 0.045, (400, 300), 4242
 FALSE = 0.002  # [m]
@@ -45,13 +46,9 @@ def run() -> None:
 def _rig() -> Rig:
     cameras = []
     for name, x in (("middle", 0.0), ("left", -0.18), ("right", 0.18)):
-        place = np.array([x, 0.02, -1.0])
-        z = -place / np.linalg.norm(place)
-        across = np.cross((0.0, 1.0, 0.0), z)
-        across /= np.linalg.norm(across)
-        R = np.stack([across, np.cross(z, across), z])
+        T = look_at(np.array([x, 0.02, -1.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
         K = [[1100.0, 0, SIZE[0] / 2], [0, 1100.0, SIZE[1] / 2], [0, 0, 1]]
-        cameras.append(Camera(name, SIZE, K, (-0.05, 0.01, 0, 0), "radtan", se3.transform(R, -R @ place)))
+        cameras.append(Camera(name, SIZE, K, (-0.05, 0.01, 0, 0), "radtan", T))
     return Rig(tuple(cameras))
 
 

@@ -25,6 +25,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.motion import read_motion
+from kinefit.simulation.figures import look_at
 from kinefit.simulation.rendering.scenes import SimulatedScene
 
 OFF = {"arm_flex_r": 4.0, "arm_add_r": -4.0, "arm_rot_r": 4.0, "elbow_flex_r": -4.0, "pro_sup_r": 5.0}  # [deg]
@@ -65,12 +66,9 @@ def cameras(size: int) -> Rig:
     out, aim = [], np.array([0.2, -0.3, 0.0])
     for name, x in (("middle", 0.0), ("left", -0.2), ("right", 0.2)):
         place = np.array([0.2 + x, -0.2, 1.3])
-        forward = (aim - place) / np.linalg.norm(aim - place)
-        right = np.cross(forward, [0.0, 1.0, 0.0])
-        right /= np.linalg.norm(right)
-        R = np.stack([right, np.cross(forward, right), forward])
+        T = look_at(place, aim, np.array([0.0, 1.0, 0.0]))
         K = np.array([[1.6 * size, 0, size / 2], [0, 1.6 * size, size / 2], [0, 0, 1]])
-        out.append(Camera(name, (size, size), K, np.zeros(4), "radtan", se3.transform(R, -R @ place)))
+        out.append(Camera(name, (size, size), K, np.zeros(4), "radtan", T))
     return Rig(tuple(out))
 
 

@@ -37,6 +37,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.motion import read_motion
 from kinefit.simulation import squat_and_wave
+from kinefit.simulation.figures import look_at
 from kinefit.simulation.rendering.scenes import SimulatedScene
 
 CLICKS = 2.0  # [px]
@@ -104,14 +105,11 @@ def cameras(setup: Setup) -> Rig:
     out, aim, size = [], np.array(setup.aim), setup.image
     for k, name in enumerate(("left", "middle", "right")):
         place = aim + setup.away + (k - 1) * np.array(setup.apart) + (0.0, 0.1 * (k == 1), 0.0)
-        forward = (aim - place) / np.linalg.norm(aim - place)
-        right = np.cross(forward, [0.0, 1.0, 0.0])
-        right /= np.linalg.norm(right)
-        R = np.stack([right, np.cross(forward, right), forward])
+        T = look_at(place, aim, np.array([0.0, 1.0, 0.0]))
         f = (setup.focal + 0.02 * k) * size
         K = np.array([[f, 0, size / 2 + 3 * k], [0, f, size / 2 - 2 * k], [0, 0, 1]])
         lens = np.array([-0.12 + 0.02 * k, 0.03, 2e-4, -1e-4, 0.0])
-        out.append(Camera(name, (size, size), K, lens, "radtan", se3.transform(R, -R @ place)))
+        out.append(Camera(name, (size, size), K, lens, "radtan", T))
     return Rig(tuple(out))
 
 
