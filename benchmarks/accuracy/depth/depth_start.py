@@ -63,21 +63,11 @@ def camera_in_front(sensor: Any) -> Any:
 def seen(body: Any, states: list[Any], camera: Any, sensor: Any, *, room: bool) -> list[NDArray]:
     """The depth image of each state."""
     from kinefit.simulation.rendering.sensors import simulate_depth
-
-    video = simulate_depth(_motion(body, states), camera, sensor, room=room)
-    return [video.frame(k).depth for k in range(len(states))]
-
-
-def _motion(body: Any, states: list[Any]) -> Any:
-    from kinefit.bodies.motion import Motion
+    from kinefit.simulation.retarget import known_motion
 
     roots, angles = np.array([s.T_world_root for s in states]), np.array([s.angles for s in states])
-    count, parts = len(states), len(body.tree.segments)
-    return Motion(
-        body=body, rate=1.0, times=np.arange(count, dtype=float), Ts_world_root=roots, angles=angles,
-        dof_std=np.zeros((count, body.tree.n_dofs)), joint_std=np.zeros((count, parts, 3)), quality=np.ones(count),
-        segment_quality=np.ones((count, parts)), up="y",
-    )  # fmt: skip
+    video = simulate_depth(known_motion(body, 1.0, roots, angles), camera, sensor, room=room)
+    return [video.frame(k).depth for k in range(len(states))]
 
 
 def joints(body: Any, state: Any) -> NDArray:

@@ -18,10 +18,8 @@ import numpy as np
 from benchmarks.accuracy.mixed.mixed_runs import MIXES
 from benchmarks.accuracy.mixed.mixed_takes import RATE, Recording, detected, record, take_text, write
 from benchmarks.figures import LEFT_OUT, amount, figure
+from benchmarks.scenes.simulated import calibrated, write_cameras
 from kinefit import Motion, track_take
-from kinefit.geometry import se3
-from kinefit.geometry.camera import Rig
-from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import studio_rig
 from kinefit.simulation.evaluation import angle_errors
 
@@ -66,18 +64,8 @@ def around(recording: Recording, folder: Path, cameras: int, draw: int, seen: Mo
     """
     random = np.random.default_rng([31, draw, cameras])
     rig = studio_rig(recording.truth, cameras=cameras)
-    told = Rig(tuple(
-        c.with_pose(se3.transform(se3.exp_so3(random.normal(0, np.radians(0.1), 3)), random.normal(0, 0.003, 3))
-                    @ c.T_camera_world) for c in rig
-    ))  # fmt: skip
-    write_calibration(told, folder / f"calibration_{cameras}.toml")
-    text = f'[take]\nrate = {RATE}\nup = "y"\n[calibration]\nfile = "{folder}/calibration_{cameras}.toml"\n'
     points = detected(seen or recording.truth, rig, draw + AGAIN * (seen is not None), cameras=rig.names)
-    for name, own in zip(rig.names, points):
-        np.save(folder / f"{cameras}_{name}.npy", own)
-        text += f'[[camera]]\nname = "{name}"\n[[keypoints]]\ncamera = "{name}"\nformat = "mediapipe"\n'
-        text += f'file = "{folder}/{cameras}_{name}.npy"\nrate = {RATE}\n'
-    return text
+    return write_cameras(folder, calibrated(rig, random), points, RATE, f"{cameras}_")
 
 
 def off(recording: Recording, motion) -> tuple[float, float]:

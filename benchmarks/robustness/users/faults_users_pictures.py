@@ -19,6 +19,7 @@ import kinefit
 from benchmarks.accuracy.people.people_real import take_of
 from benchmarks.commands import QUIET, answer
 from benchmarks.figures import data
+from benchmarks.scenes.simulated import rows_of
 from kinefit.errors import ObservationError
 from kinefit.observations import Keypoints
 from kinefit.readers.landmarks.detections import detections_file, read_detections
@@ -61,7 +62,7 @@ def openpose() -> list[NDArray]:
     records = [read_openpose(folder / "openpose_json" / c, camera=c, rate=60.0) for c in CAMERAS]
     calibration = kinefit.read_calibration(folder / "Calib_refined_static.toml")
     man = kinefit.Recording.of_keypoints(calibration.select(CAMERAS), records).keypoints
-    return [np.nan_to_num(np.concatenate([k.points[:, 0], k.confidence[:, 0, :, None]], axis=-1)) for k in man]
+    return [rows_of(k) for k in man]
 
 
 def write_take(folder: Path, cameras: Sequence[Sequence[NDArray]], *, keys: str = "", array: bool = False) -> Path:
