@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.people.people_crowds import RATE, SET, _along, _hidden
+from benchmarks.accuracy.people.people_crowds import RATE, SET, along, hidden
 from kinefit import load_body
 from kinefit.bodies.motion import Motion
 from kinefit.errors import KinefitError
@@ -66,7 +66,7 @@ def _someone(
     body = persons(load_body("humanoid"), count=1, seed=seed)[0].body
     px = np.linspace(x, x if to is None else to, FRAMES)
     path = np.column_stack([px, np.full(FRAMES, z), np.full(FRAMES, turn)])
-    return _along(movement(name, body, rate=RATE), path, FRAMES)
+    return along(movement(name, body, rate=RATE), path, FRAMES)
 
 
 def _seen(motions: Sequence[Motion], rig: Rig) -> list[list[Pixels]]:
@@ -75,9 +75,9 @@ def _seen(motions: Sequence[Motion], rig: Rig) -> list[list[Pixels]]:
     each = [simulate_keypoints(m, rig, SET, seed=k) for k, m in enumerate(motions)]
     out = []
     for c, camera in enumerate(rig):
-        hidden = _hidden(motions, camera, there)
+        behind = hidden(motions, camera, there)
         out.append([
-            (e[c].points[:, 0], np.where(hidden[:, k], 0.0, e[c].confidence[:, 0])) for k, e in enumerate(each)
+            (e[c].points[:, 0], np.where(behind[:, k], 0.0, e[c].confidence[:, 0])) for k, e in enumerate(each)
         ])  # fmt: skip
     return out
 
@@ -159,7 +159,7 @@ def _returning(*sizes: float) -> Case:
     for k, size in enumerate(sizes):
         own = body.scaled([size] * len(body.scale_groups))
         path = np.column_stack([side if k else -side, np.full(FRAMES, 0.1), np.full(FRAMES, 0.6)])
-        motions.append(_along(movement("wave", own, rate=RATE), path, FRAMES))
+        motions.append(along(movement("wave", own, rate=RATE), path, FRAMES))
     rig = _rig()
     there = (np.arange(FRAMES) < GONE) | (np.arange(FRAMES) >= BACK)
     seen = [[(uv, np.where(there[:, None], sure, 0.0)) for uv, sure in each] for each in _seen(motions, rig)]

@@ -28,7 +28,7 @@ def run() -> None:
     for kind, seed in sequences[:2] if quick() else sequences:
         seen = crowd(kind, seed, amount(150, 45))
         people = people_of(seen.rig, seen.keypoints)
-        whose = [owners_of(seen, one.chosen) for one in people]
+        whose = [owners_of(seen.order, one.chosen) for one in people]
         others = [(w >= 0) & (w != np.bincount(w[w >= 0]).argmax()) for w in whose]
         exchanged += sum(int(np.any(2 * o.sum(axis=0) > (w >= 0).sum(axis=0))) for o, w in zip(others, whose))
         mixed = sum(int(o.sum()) for o in others)
@@ -54,10 +54,10 @@ def run() -> None:
     _speed()
 
 
-def owners_of(seen: Crowd, chosen: tuple) -> np.ndarray:
+def owners_of(orders: Sequence[np.ndarray], chosen: Sequence[np.ndarray]) -> np.ndarray:
     """(C, F) whose detections somebody has, -1 for none."""
     out = []
-    for mine, order in zip(chosen, seen.order):
+    for mine, order in zip(chosen, orders):
         match = (order == mine[:, None]) & (mine[:, None] >= 0)
         out.append(np.where(match.any(axis=1), match.argmax(axis=1), -1))
     return np.array(out)
