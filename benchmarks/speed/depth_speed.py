@@ -16,7 +16,6 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from time import process_time
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import FAILED, LEFT_OUT, amount, figure, peers, quick
 from benchmarks.peers.environments import measured, on_one_core
+from benchmarks.timing import timed
 
 MOVEMENTS = amount(("walk", "clap", "sit_down", "kick"), ("clap",))  # all of the body, its arms, all its bends, one leg
 POINTS, COUNTS = 5000, (1000, 2000, 5000, 10000, 20000, 50000)
@@ -124,9 +124,8 @@ class Stage:
         tracker.start_at(self.motion.state(0))
         ms, results = [], []
         for frame in frames:
-            began = process_time()
-            results.append(tracker.update([frame]))
-            ms.append(1e3 * (process_time() - began))
+            with timed(ms, 1e3):
+                results.append(tracker.update([frame]))
         return np.array(ms), results
 
     def error(self, results: list[Any]) -> NDArray:

@@ -16,6 +16,7 @@ import numpy as np
 
 from benchmarks.figures import NotMeasured, amount, each, figure
 from benchmarks.scenes.marker_takes import broken, load, shuffled
+from benchmarks.timing import timed
 from kinefit import Markers, fit_marker_subject, fit_markers, identify, identify_take, learn_model, load_body
 from kinefit.markers.model.model import MarkerModel
 
@@ -42,9 +43,8 @@ def large_set() -> None:
         times, right, seen = [], 0, 0
         for f in np.unique(np.linspace(0, len(asked) - 1, FRAMES).astype(int)):
             points, truth = shuffled(asked, model.labels, int(f), rng, ghosts=ghosts)
-            start = time.process_time()
-            found = identify(model, points).assignment
-            times.append(1e3 * (time.process_time() - start))
+            with timed(times, 1e3):
+                found = identify(model, points).assignment
             right += int(((found == truth) & (truth >= 0)).sum())
             seen += int((truth >= 0).sum())
         print(f"# {len(model)} markers: median {np.median(times):.0f} ms, {100 * right / seen:.1f} % of labels right")

@@ -5,7 +5,6 @@ A rendered person (the catalogue's humanoid, painted in parts) sways before a wa
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
 from benchmarks.scenes.silhouettes_scene import ring, swaying
+from benchmarks.timing import timed
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.rendering import render_body
 from kinefit.bodies.surfaces.places import body_mesh
@@ -54,9 +54,8 @@ def run() -> None:
             tracker.start_at(truth[0])
             for i, images in enumerate(seen):
                 frames = [ColourFrame(name, i / RATE, images[name]) for name in rig.names[:count]]
-                began = time.process_time()
-                result = tracker.update(frames)
-                times.append(1e3 * (time.process_time() - began))
+                with timed(times, 1e3):
+                    result = tracker.update(frames)
                 assert result is not None
                 off.append(np.degrees(np.abs(result.state.angles - truth[i].angles)).mean())
             spent.append(times)

@@ -8,7 +8,6 @@ the median. One body of cylinders and ellipsoids, default settings; the first fr
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure
 from benchmarks.scenes.silhouettes_scene import ring, swaying
 from benchmarks.speed.regions_speed import pictures
+from benchmarks.timing import timed
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.rendering import render_body
 from kinefit.bodies.surfaces.places import body_mesh
@@ -71,9 +71,8 @@ def spent(
             tracker.know_background(camera.name, image)
         tracker.start_at(truth[0])
         for state, frames in zip(truth, seen):
-            began = time.process_time()
-            result = tracker.update(frames)
-            times.append(1e3 * (time.process_time() - began))
+            with timed(times, 1e3):
+                result = tracker.update(frames)
             assert result is not None
             off.append(np.degrees(np.abs(result.state.angles - state.angles)).mean())
         rounds.append(times)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from benchmarks.commands import used
 from benchmarks.figures import LEFT_OUT, amount, figure, quick, recording
+from benchmarks.timing import took
 
 _TAKE = """
 import sys
@@ -58,9 +59,8 @@ def run() -> None:
 
 def _whole(words: list[object], environment: dict[str, str]) -> tuple[float, float]:
     """[s] that a command takes, and [MB] of memory at most."""
-    began = time.perf_counter()
-    _, memory = used(*words, env=environment)
-    return time.perf_counter() - began, memory
+    (_, memory), seconds = took(lambda: used(*words, env=environment), clock=time.perf_counter)
+    return seconds, memory
 
 
 def _first(take: Path, environment: dict[str, str]) -> float:

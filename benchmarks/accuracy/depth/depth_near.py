@@ -11,9 +11,9 @@ edges, on slanted surfaces and by chance. Settings were chosen on odd numbers, f
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
+from benchmarks.timing import took
 from kinefit import load_body, track_take
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.motion import BELIEVED, Motion
@@ -83,9 +84,8 @@ def run() -> None:
     asked, spent = [], []
     for seed in range(0, 2 * TAKES, 2):
         take = near_take(seed)
-        begin = time.process_time()
-        motion = tracked(take)
-        spent.append((time.process_time() - begin) / len(take.images))
+        motion, seconds = took(partial(tracked, take))
+        spent.append(seconds / len(take.images))
         g, gone = errors(take, motion)
         gaps, lost = [*gaps, g], [*lost, gone]
         asked.append([[part in seen for part in _PARTS] for seen in take.seen])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
+from benchmarks.timing import timed
 
 _POSES, _NEAR = amount(16, 2), 0.1  # [m] a joint this near its true place is found
 _PEOPLE = amount(20, 1)
@@ -88,9 +88,8 @@ def _recovered(body: Any) -> None:
         truth = [random_state(body, np.random.default_rng(100 + i), sitting=seat) for i, seat in enumerate(seats)]
         found, spent = [], []
         for depth, state in zip(seen(body, truth, camera, KINECT, room=room), truth):
-            begin = time.process_time()
-            start = start_from_points(body, None, camera, depth, up=_UP)[0]
-            spent.append(time.process_time() - begin)
+            with timed(spent):
+                start = start_from_points(body, None, camera, depth, up=_UP)[0]
             found.append(np.linalg.norm(joints(body, start.state) - joints(body, state), axis=1) < _NEAR)
         rate = np.mean(found, axis=1)
         figure(f"start_recovered{suffix}", float(np.mean(rate)), f"of joints within 100 mm, {count} poses", ">= 0.9")

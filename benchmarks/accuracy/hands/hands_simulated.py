@@ -9,7 +9,6 @@ seconds no camera sees the left hand. Settings were chosen on seeds 0 to 3; prin
 from __future__ import annotations
 
 import tempfile
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from benchmarks.commands import ended
 from benchmarks.figures import FAILED, amount, figure
 from benchmarks.scenes.simulated import rows_of, without
 from benchmarks.scenes.simulated import somebody as with_other_lengths
+from benchmarks.timing import fastest
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, read_motion, track
 from kinefit.bodies import Body
 from kinefit.geometry import se3
@@ -186,9 +186,5 @@ def run() -> None:
 
 def _speed(rig: Rig, seen: list[Keypoints], name: str) -> float:
     """Frames a second of processor time, size of the person and smoothing included: the better of two."""
-    recording, spent = Recording.of_keypoints(rig, seen, up="y"), []
-    for _ in range(amount(2, 1)):
-        began = time.process_time()
-        track(recording, load_body(name))
-        spent.append(time.process_time() - began)
-    return len(seen[0].points) / min(spent)
+    recording = Recording.of_keypoints(rig, seen, up="y")
+    return len(seen[0].points) / fastest(lambda: track(recording, load_body(name)), amount(2, 1))[1]

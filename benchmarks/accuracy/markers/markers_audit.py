@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from benchmarks.figures import NotMeasured, amount, data, each, figure
 from benchmarks.scenes.marker_takes import put_right
+from benchmarks.timing import timed, took
 from kinefit.bodies.marker_sets import find_marker_set
 from kinefit.markers.audit.audit import audit_take
 from kinefit.markers.model.learn import learn_model, training_gate
@@ -114,9 +114,8 @@ def run() -> None:
         if markers is None:
             continue
         takes += 1
-        start = time.process_time()
-        before = audit_take(markers)
-        seconds.append(time.process_time() - start)
+        with timed(seconds):
+            before = audit_take(markers)
         alarms += sum(f.kind in ("swapped", "throughout") for f in before)
         for wrong, pair, first, last in injected(markers, learn_model(markers), rng):
             found = [f for f in audit_take(wrong) if f.kind in ("swapped", "throughout")]
@@ -233,9 +232,8 @@ def gappy() -> None:
         (a, b), f = rng.choice(x.shape[1], 2, replace=False), int(rng.integers(len(x) - 200))
         n = int(rng.integers(5, 200))
         x[f : f + n, [a, b]] = x[f : f + n, [b, a]]
-    start = time.process_time()
-    found = audit_take(replace(markers, positions=x, residual=None))
-    figure("audit_seconds_gaps_and_swaps", time.process_time() - start, "s CPU", "<= 5")
+    found, seconds = took(lambda: audit_take(replace(markers, positions=x, residual=None)))
+    figure("audit_seconds_gaps_and_swaps", seconds, "s CPU", "<= 5")
     print(f"# {sum(f.kind == 'swapped' for f in found)} exchanges reported of 15 injected into gaps")
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
 from benchmarks.scenes.marker_takes import CASES, HELD, Case, broken, load, shuffled, training
+from benchmarks.timing import timed
 from kinefit.errors import ObservationError
 from kinefit.markers.frame.identify import identify
 from kinefit.markers.model.learn import learn_model
@@ -63,9 +64,8 @@ def single_frames(
     whole = np.flatnonzero(np.isfinite(take.positions[..., 0]).sum(1) >= 0.5 * take.positions.shape[1])
     for f in whole[np.unique(np.linspace(0, len(whole) - 1, frames).round().astype(int))]:
         points, truth = shuffled(take, model.labels, int(f), rng, missing, ghosts)
-        start = time.process_time()
-        told = identify(model, points)
-        times.append(time.process_time() - start)
+        with timed(times):
+            told = identify(model, points)
         found, guess = told.assignment, told.assignment if told.guess is None else told.guess
         held = [max(int((guess[list(s)] >= 0).sum()) for s in model.segments if m in s) for m in range(len(model))]
         names.append(np.stack([told.confidence, guess == truth, held], axis=1)[guess >= 0])

@@ -11,14 +11,15 @@ Nothing was fitted to them. Two people are in the first and the last image of th
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, each, figure, recording
+from benchmarks.timing import took
 from kinefit import Motion, track_take
 from kinefit.bodies.motion import BELIEVED
 from kinefit.readers.take.load import Observations
@@ -96,12 +97,10 @@ def _kinect() -> None:
             (Path(work) / f"depth-data-{name}").symlink_to(folder / f"depth-data-{name}")
         text = _TAKE.format(rate=1.0, frames=len(names), folder=work, unit=0.001, lens=[575.0, 575.0, 319.5, 239.5],
                             range=[0.5, 5.0], more="size = [640, 480]\n")  # fmt: skip
-        begin = time.process_time()
-        motion, seen = _tracked(text, Path(work))
-        spent = (time.process_time() - begin) / len(names)
+        (motion, seen), spent = took(lambda: _tracked(text, Path(work)))
         gaps = _gaps(motion, seen, dict(enumerate(KINECT[name] for name in names)))
     figure("people_kinect_images", float(np.sum(motion.quality > 0.0)), *_GOALS["people_kinect_images"])
-    _figures("people_kinect", [gap for (_, of), gap in gaps.items() if of != "head"], 0.06, spent)
+    _figures("people_kinect", [gap for (_, of), gap in gaps.items() if of != "head"], 0.06, spent / len(names))
     heads = [gap for (_, of), (gap, _) in gaps.items() if of == "head"]
     print(f"# heads, the middle between the ears: median {100 * float(np.median(heads)):.0f} cm off")
     _tell(gaps, names, 0.06)
@@ -115,9 +114,8 @@ def _sr305() -> None:
         with tempfile.TemporaryDirectory() as work:
             text = _TAKE.format(rate=1.5, frames=count, folder=folder / take, unit=0.000125, range=[0.2, 2.0], more="",
                                 lens=[476.007, 476.007, 313.683, 242.755])  # fmt: skip
-            begin = time.process_time()
-            motion, seen = _tracked(text, Path(work))
-            spent.append((time.process_time() - begin) / count)
+            (motion, seen), seconds = took(partial(_tracked, text, Path(work)))
+            spent.append(seconds / count)
             gaps = _gaps(motion, seen, dict(enumerate(list(images.values())[:count])))
         print(f"# {take}")
         _tell(gaps, list(images), 0.04)

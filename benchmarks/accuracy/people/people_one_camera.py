@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from benchmarks.commands import ended
 from benchmarks.figures import NotMeasured, data, figure, quick
+from benchmarks.timing import took
 from kinefit import Motion, load_body, read_motion
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry import se3
@@ -84,9 +85,7 @@ def _of_trial(markers: Path, folder: Path, trial: str) -> Mapping[str, float]:
     ended("init", folder, check=True)
     take = folder / "take.toml"
     take.write_text(take.read_text().replace("# height = 1.75", f"height = {stature:.2f}  #"))
-    began = time.perf_counter()
-    ended("track", take, check=True)
-    took = time.perf_counter() - began
+    _, seconds = took(lambda: ended("track", take, check=True), clock=time.perf_counter)
     motion = read_motion(folder / "take-kinefit" / "motion.npz")
     take.write_text(take.read_text().replace("height = ", "# height = "))
     ended("track", take, "--pictures", "none", "--no-report", check=True)
@@ -101,9 +100,9 @@ def _of_trial(markers: Path, folder: Path, trial: str) -> Mapping[str, float]:
           f"absolute {unstated['one_camera_absolute']:.1f}, height {without.body.stature:.2f} m", flush=True)
     lost, quality = motion.lost.mean(), motion.quality.mean()
     print(f"{trial}: {lost:.1%} of segments lost, quality {quality:.2f}, height {stature:.2f} m", flush=True)
-    print(f"{trial}: {len(motion)} frames in {took:.1f} s", flush=True)
+    print(f"{trial}: {len(motion)} frames in {seconds:.1f} s", flush=True)
     ours["one_camera_absolute_without_stature"] = unstated["one_camera_absolute"]
-    return {**ours, "frames": len(motion), "seconds": took}
+    return {**ours, "frames": len(motion), "seconds": seconds}
 
 
 def _balancing() -> None:

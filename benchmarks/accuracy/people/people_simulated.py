@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 import numpy as np
 
 from benchmarks.accuracy.people.people_crowds import KINDS, Crowd, crowd
 from benchmarks.figures import amount, figure, quick
+from benchmarks.timing import timed
 from kinefit import Motion, load_body
 from kinefit.fitting.multiview.followed import PersonKeypoints, follow
 from kinefit.fitting.multiview.people import PersonTrack, people_of
@@ -100,13 +100,12 @@ def _speed() -> None:
         seen = crowd(kind, 0, amount(150, 45))
         times = []
         for _ in range(amount(3, 1)):
-            began = time.process_time()
-            people = people_of(seen.rig, seen.keypoints)
-            for k in range(len(people)):
-                one = follow(seen.rig, seen.keypoints, k + 1, people)  # who is who is found once, as by the command
-                alone = _alone(seen, one, k)
-                track(alone, load_body("humanoid"), smooth=False)
-            times.append(time.process_time() - began)
+            with timed(times):
+                people = people_of(seen.rig, seen.keypoints)
+                for k in range(len(people)):
+                    one = follow(seen.rig, seen.keypoints, k + 1, people)  # who is who is found once, as by the command
+                    alone = _alone(seen, one, k)
+                    track(alone, load_body("humanoid"), smooth=False)
         spent[count] = min(times) / len(seen.keypoints[0])
         print(f"# {count} people, {len(seen.rig)} cameras: {1 / spent[count]:.0f} frames/s, all but smoothing")
     figure("people_speed_two", 1 / spent[2], "frames/s", ">= 100")

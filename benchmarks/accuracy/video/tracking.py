@@ -20,6 +20,7 @@ from benchmarks.figures import LEFT_OUT, NotMeasured, amount, each, figure, quic
 from benchmarks.scenes.balancing import TRIAL, trial_text
 from benchmarks.scenes.held_out import sides_right
 from benchmarks.scenes.motions import library
+from benchmarks.timing import took
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, load_observations, read_take, track
 from kinefit.geometry.lines import triangulate_robust
 from kinefit.simulation import simulate_keypoints, studio_rig
@@ -96,9 +97,7 @@ def free_points_held_out(trial: Trial, whole: Motion) -> float:
 
 def wall(trial: Trial, *, smooth: bool) -> float:
     """Seconds from keypoints to motion, once the kernels are there."""
-    began = time.perf_counter()
-    track(trial.recording, load_body("humanoid"), smooth=smooth)
-    return time.perf_counter() - began
+    return took(lambda: track(trial.recording, load_body("humanoid"), smooth=smooth), clock=time.perf_counter)[1]
 
 
 def middle(errors: NDArray) -> float:

@@ -11,7 +11,6 @@ import os
 
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
-import time
 from collections.abc import Callable
 from functools import partial
 
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
 from benchmarks.scenes.marker_takes import STANFORD, load, shuffled
+from benchmarks.timing import timed
 from kinefit.bodies.marker_sets import find_marker_set
 from kinefit.markers.frame.identify import identify
 from kinefit.markers.model.from_frame import model_from_frame
@@ -64,9 +64,8 @@ def score(method: Identifier, model: MarkerModel, take: Markers, missing: float,
     rng, right, wrong, seen, times = np.random.default_rng(0), 0, 0, 0, []
     for f in np.unique(np.linspace(0, len(take) - 1, FRAMES).round().astype(int)):
         points, truth = shuffled(take, model.labels, int(f), rng, missing, extra)
-        start = time.process_time()
-        found = method(model, points)
-        times.append(time.process_time() - start)
+        with timed(times):
+            found = method(model, points)
         right += int(((found == truth) & (truth >= 0)).sum())
         wrong += int(((found != truth) & (found >= 0)).sum())
         seen += int((truth >= 0).sum())

@@ -11,7 +11,6 @@ import os
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure, quick
 from benchmarks.papers.markers.synthetic_points import random_pose, synthetic_body
+from benchmarks.timing import timed
 from kinefit.markers.frame.identify import identify
 from kinefit.markers.model.model import MarkerModel
 from kinefit.papers.sapm import sapm
@@ -54,9 +54,8 @@ def score(method: Identifier, model: MarkerModel, poses: int, seed: int = 1, **k
     times = []
     for _ in range(poses):
         pose = random_pose(model, rng, **kind)
-        start = time.process_time()
-        found = method(model, pose.points)
-        times.append(1e3 * (time.process_time() - start))
+        with timed(times, 1e3):
+            found = method(model, pose.points)
         good = found == pose.truth
         whole += bool(good.all())
         right += int((good & (pose.truth >= 0)).sum())

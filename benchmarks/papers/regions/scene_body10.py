@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.timing import timed
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.bodies.surfaces import MeshSurface
 from kinefit.bodies.surfaces.mesh import BodyMesh, read_obj
@@ -249,7 +250,6 @@ def run_scene(
     tracker : (body, rig, rate) -> an object with `start_at(state)` and `update(frames)`.
     kinds : of sensors, "depth", "region" or both
     """
-    from time import process_time
 
     chosen = list(range(0, len(scene), every) if frames is None else frames)
     made = tracker(scene.body, scene.rig, RATE / every)
@@ -257,9 +257,8 @@ def run_scene(
     add, ms, results = [], [], []
     for i in chosen:
         frames_at = scene.seen(i, kinds)
-        begin = process_time()
-        result = made.update(frames_at(i / RATE))
-        ms.append(1e3 * (process_time() - begin))
+        with timed(ms, 1e3):
+            result = made.update(frames_at(i / RATE))
         add.append(scene.add(result.state, i))
         results.append(result)
     lost = np.array([r.lost for r in results])
