@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import data
 from kinefit.bodies.marker_sets import find_marker_set
+from kinefit.markers.take.takes import one_after_the_other
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
 
@@ -162,14 +163,7 @@ def training(case: Case) -> Markers | None:
     takes = [load(part) for part in case.train]
     if any(t is None for t in takes):
         return None
-    found = [t for t in takes if t is not None]
-    names = tuple(dict.fromkeys(n for t in found for n in t.names))
-    positions = np.full((sum(map(len, found)), len(names), 3), np.nan)
-    at = 0
-    for t in found:
-        positions[at : at + len(t), [names.index(n) for n in t.names]] = t.positions
-        at += len(t)
-    return replace(found[0], names=names, positions=positions)
+    return one_after_the_other([t for t in takes if t is not None])
 
 
 def truth_of(take: Markers, labels: tuple[str, ...]) -> NDArray:
@@ -201,6 +195,12 @@ def shuffled(
     order = rng.permutation(len(at))
     where = {take.names[c]: i for i, c in enumerate(column[order]) if c >= 0}
     return at[order], np.array([where.get(n, -1) for n in labels])
+
+
+def counts(found: NDArray, truth: NDArray) -> NDArray:
+    """(3,) how many labels of a frame are right, have a point that is not theirs, and are seen; both (M,)."""
+    right = found == truth
+    return np.array([(right & (truth >= 0)).sum(), (~right & (found >= 0)).sum(), (truth >= 0).sum()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,6 +265,18 @@ def broken(
         positions[rows, c], truth[rows, c] = at, own
     names = tuple(f"*{i + 1}" for i in range(len(pieces)))
     return Broken(replace(take, names=names, positions=positions, residual=None), truth)
+
+
+def shares(column: NDArray, cut: Broken, take: Markers, labels: Sequence[str]) -> tuple[float, float]:
+    """Shares of the labels seen in a broken take that have the right name, and a wrong one.
+
+    column : (F, M) the column that each label was given, -1 for none.
+    """
+    own = np.array([take.names.index(n) if n in take.names else -9 for n in labels])
+    named = np.where(column >= 0, cut.truth[np.arange(len(take))[:, None], column], -2)
+    seen = (cut.truth[:, :, None] == own).any(1)
+    wrong = (column >= 0) & (named != own)
+    return float(((named == own) & seen).sum() / seen.sum()), float(wrong.sum() / seen.sum())
 
 
 def _meetings(P: NDArray, rate: float, near: float = 0.06) -> Iterator[tuple[int, int, int]]:

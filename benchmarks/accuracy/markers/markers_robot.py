@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from benchmarks.commands import printed
 from benchmarks.figures import amount, figure
+from benchmarks.scenes.marker_takes import counts
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.exporters import write_markers
 from kinefit.markers.frame.identify import identify
@@ -115,7 +116,7 @@ def learn(robot: Robot, folder: Path, seed: int) -> Path:
 def single_frames(robot: Robot, model_file: Path, poses: int, seed: int) -> tuple[float, float, float]:
     """Shares [%] of seen markers that get their own name, of names that are wrong, and of poses without a mistake."""
     model, rng = load_model(model_file), np.random.default_rng([seed, 2])
-    tree, right, wrong, seen, whole = robot.body.tree, 0, 0, 0, 0
+    tree, counted, whole = robot.body.tree, np.zeros(3, int), 0
     order = [model.labels.index(label) for label in robot.labels]
     for _ in range(poses):
         x = positions(robot, rng.uniform(tree.lower, tree.upper)[None], rng)[0]
@@ -125,10 +126,9 @@ def single_frames(robot: Robot, model_file: Path, poses: int, seed: int) -> tupl
         truth = np.full(len(x), -1)
         truth[there] = np.argsort(shuffled)[: there.sum()]
         found = identify(model, points[shuffled]).assignment[order]
-        right += int(((found == truth) & there).sum())
-        wrong += int(((found >= 0) & (found != truth)).sum())
-        seen += int(there.sum())
+        counted += counts(found, truth)
         whole += bool((found == truth).all())
+    right, wrong, seen = counted.tolist()
     return 100 * right / seen, 100 * wrong / max(right + wrong, 1), 100 * whole / poses
 
 

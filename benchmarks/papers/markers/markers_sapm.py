@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
-from benchmarks.scenes.marker_takes import STANFORD, load, shuffled
+from benchmarks.scenes.marker_takes import STANFORD, counts, load, shuffled
 from benchmarks.timing import timed
 from kinefit.bodies.marker_sets import find_marker_set
 from kinefit.markers.frame.identify import identify
@@ -61,14 +61,13 @@ def ours(model: MarkerModel, points: NDArray) -> NDArray:
 
 def score(method: Identifier, model: MarkerModel, take: Markers, missing: float, extra: int) -> tuple[float, ...]:
     """Right and wrong [%], seconds of a frame (median), over frames spread over a take."""
-    rng, right, wrong, seen, times = np.random.default_rng(0), 0, 0, 0, []
+    rng, counted, times = np.random.default_rng(0), np.zeros(3, int), []
     for f in np.unique(np.linspace(0, len(take) - 1, FRAMES).round().astype(int)):
         points, truth = shuffled(take, model.labels, int(f), rng, missing, extra)
         with timed(times):
             found = method(model, points)
-        right += int(((found == truth) & (truth >= 0)).sum())
-        wrong += int(((found != truth) & (found >= 0)).sum())
-        seen += int((truth >= 0).sum())
+        counted += counts(found, truth)
+    right, wrong, seen = counted.tolist()
     return 100 * right / seen, 100 * wrong / seen, float(np.median(times))
 
 

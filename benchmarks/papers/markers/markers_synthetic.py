@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure, quick
 from benchmarks.papers.markers.synthetic_points import random_pose, synthetic_body
+from benchmarks.scenes.marker_takes import counts
 from benchmarks.timing import timed
 from kinefit.markers.frame.identify import identify
 from kinefit.markers.model.model import MarkerModel
@@ -50,17 +51,14 @@ def ours(model: MarkerModel, points: NDArray) -> NDArray:
 def score(method: Identifier, model: MarkerModel, poses: int, seed: int = 1, **kind: float) -> Score:
     """A method over random poses of one kind."""
     rng = np.random.default_rng(seed)
-    whole = right = wrong = seen = 0
-    times = []
+    whole, counted, times = 0, np.zeros(3, int), []
     for _ in range(poses):
         pose = random_pose(model, rng, **kind)
         with timed(times, 1e3):
             found = method(model, pose.points)
-        good = found == pose.truth
-        whole += bool(good.all())
-        right += int((good & (pose.truth >= 0)).sum())
-        wrong += int((~good & (found >= 0)).sum())
-        seen += int((pose.truth >= 0).sum())
+        whole += bool((found == pose.truth).all())
+        counted += counts(found, pose.truth)
+    right, wrong, seen = counted.tolist()
     return Score(whole / poses, right / seen, wrong / (poses * len(model)), float(np.median(times)), max(times))
 
 
