@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-
-from kinefit.bodies.motion import Motion
-from kinefit.readers.take.file import read_take
-from kinefit.readers.take.load import Observations, load_observations
-from kinefit.takes.track import track_take
 
 TRIAL = "video_balancing_4cam"
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
@@ -49,21 +43,3 @@ def trial_text(
 def masks_of(folder: Path, camera: str) -> str:
     """The table of the masks that the recording has."""
     return f'[[silhouette]]\ncamera = "{camera}"\nfile = "{folder}/person_masks/{camera}"\nframe = "video"\n'
-
-
-def seen_of(text: str) -> Observations:
-    """What the sensors of a take saw; videos are read when they are asked."""
-    with tempfile.TemporaryDirectory() as work:
-        path = Path(work) / "take.toml"
-        path.write_text(text, encoding="utf-8")
-        seen = load_observations(read_take(path))
-    assert seen.rig is not None
-    return seen
-
-
-def tracked(text: str, **options: object) -> tuple[Motion, Observations]:
-    """The motion of a take, and what its sensors saw; options of `kinefit.track_take`."""
-    with tempfile.TemporaryDirectory() as work:
-        path = Path(work) / "take.toml"
-        path.write_text(text, encoding="utf-8")
-        return track_take(path, **options)  # type: ignore[arg-type]

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy.images.silhouettes_track import take_text
 from benchmarks.figures import amount, figure, recording
-from benchmarks.scenes.balancing import seen_of, tracked
 from benchmarks.scenes.silhouettes_scene import of_meshes, ring, swaying
+from benchmarks.scenes.takes import seen_of, tracked
 from benchmarks.timing import timed
 from kinefit.bodies import Body, load_body
 from kinefit.bodies.rendering import Canvas, lens_of, render_body

@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
+from benchmarks.scenes.takes import tracked
 from benchmarks.timing import took
-from kinefit import load_body, track_take
+from kinefit import load_body
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.motion import BELIEVED, Motion
 from kinefit.bodies.surfaces import TaperedCylinder
@@ -84,7 +85,7 @@ def run() -> None:
     asked, spent = [], []
     for seed in range(0, 2 * TAKES, 2):
         take = near_take(seed)
-        motion, seconds = took(partial(tracked, take))
+        motion, seconds = took(partial(motion_of, take))
         spent.append(seconds / len(take.images))
         g, gone = errors(take, motion)
         gaps, lost = [*gaps, g], [*lost, gone]
@@ -104,7 +105,7 @@ def run() -> None:
     figure("depth_near_seconds_worst", float(np.max(spent)), "s CPU an image, slowest take", "<= 8")
 
 
-def tracked(take: NearTake) -> Motion:
+def motion_of(take: NearTake) -> Motion:
     """Its motion by `track_take` with defaults, in the camera's frame."""
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work) / "images"
@@ -112,9 +113,7 @@ def tracked(take: NearTake) -> Motion:
         for k, depth in enumerate(take.images):
             cv2.imwrite(str(folder / f"{k}.png"), np.rint(depth / UNIT).astype(np.uint16))
         K = take.camera.matrix
-        path = Path(work) / "take.toml"
-        path.write_text(_TAKE.format(rate=RATE, folder=folder, unit=UNIT, f=K[0, 0], cx=K[0, 2], cy=K[1, 2]))
-        return track_take(path)[0]
+        return tracked(_TAKE.format(rate=RATE, folder=folder, unit=UNIT, f=K[0, 0], cx=K[0, 2], cy=K[1, 2]))[0]
 
 
 def errors(take: NearTake, motion: Motion) -> tuple[NDArray, NDArray]:

@@ -32,7 +32,8 @@ from benchmarks.accuracy.gait.gait_events import (
 from benchmarks.accuracy.mixed.mixed_takes import detected, marked, with_own_points
 from benchmarks.figures import amount, figure
 from benchmarks.scenes.simulated import calibrated, write_cameras
-from kinefit import Motion, track_take
+from benchmarks.scenes.takes import tracked
+from kinefit import Motion
 from kinefit.errors import ObservationError
 from kinefit.exporters.c3d_file import write_markers
 from kinefit.exporters.gait.record import Stretch, gait_record
@@ -86,17 +87,14 @@ def by_cameras(truth: Motion, draw: int, random: np.random.Generator) -> Motion:
     told = calibrated(rig, random)
     with tempfile.TemporaryDirectory() as folder:
         text = write_cameras(Path(folder), told, detected(truth, rig, draw, cameras=rig.names), RATE)
-        (Path(folder) / "take.toml").write_text(text)
-        return track_take(Path(folder) / "take.toml")[0]
+        return tracked(text)[0]
 
 
 def by_markers(truth: Motion, random: np.random.Generator) -> Motion:
     """A walk as 45 markers measure it."""
     with tempfile.TemporaryDirectory() as folder:
         write_markers(replace(marked(truth, random), rate=RATE), Path(folder) / "markers.trc")
-        text = f'[take]\nrate = {RATE}\nup = "y"\n[[markers]]\nfile = "markers.trc"\n'
-        (Path(folder) / "take.toml").write_text(text)
-        return track_take(Path(folder) / "take.toml")[0]
+        return tracked(f'[take]\nrate = {RATE}\nup = "y"\n[[markers]]\nfile = "{folder}/markers.trc"\n')[0]
 
 
 def differences(truth: Motion, motion: Motion) -> dict[str, list[tuple[float, float]]]:

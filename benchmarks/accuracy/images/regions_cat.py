@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from benchmarks.commands import printed
 from benchmarks.figures import amount, figure, recording
 from benchmarks.scenes.regions_scene import away, rigid, state_of
+from benchmarks.scenes.takes import start_text
 from benchmarks.timing import timed
 from kinefit.bodies import Body
 from kinefit.bodies.motion import Motion
@@ -124,8 +125,7 @@ def take_of(folder: Path, work: Path, first: NDArray, every: int = 1) -> Path:
     )
     (work / "take.toml").write_text(
         f'[take]\nrate = {RATE / every}\nup = "-y"\nbody = "cat.toml"\nsize = false\n'
-        f"[start]\nat = {first[:3, 3].tolist()}\n"
-        f"forward = {first[:3, 0].tolist()}\nupward = {first[:3, 1].tolist()}\n"
+        f"{start_text(first)}"
         f'[calibration]\nfile = "calibration.toml"\n[[camera]]\nname = "cam"\nvideo = "img/*.png"\n'
         '[[region]]\ncamera = "cam"\n'
     )

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from benchmarks.accuracy.images.silhouettes_track import FRAMES, SCALE, take_text
 from benchmarks.figures import ROOT, amount, figure, recording
 from benchmarks.papers.silhouettes.silhouettes_cga import least_ms
-from benchmarks.scenes.balancing import CAMERAS, tracked
+from benchmarks.scenes.balancing import CAMERAS
 from benchmarks.scenes.silhouettes_scene import shape_from_silhouettes
+from benchmarks.scenes.takes import tracked
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.morphs.anny import AnnyModel, load_anny
 from kinefit.bodies.morphs.morphing import Morphing

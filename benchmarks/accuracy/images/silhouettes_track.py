@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import LEFT_OUT, NotMeasured, amount, figure, quick, recording
-from benchmarks.scenes.balancing import CAMERAS, masks_of, tracked, trial_text
+from benchmarks.scenes.balancing import CAMERAS, masks_of, trial_text
+from benchmarks.scenes.takes import tracked
 from kinefit.bodies import BodyState
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.rendering import render_body, scaled

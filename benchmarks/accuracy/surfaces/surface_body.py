@@ -11,13 +11,12 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.commands import printed
 from benchmarks.figures import amount, figure
-from benchmarks.scenes.textured import textured_picture
+from benchmarks.scenes.textured import textured_picture, write_video
 from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.surfaces.places import body_mesh
@@ -77,12 +76,9 @@ def record(folder: Path, motion: Motion, rig: Rig, seed: int) -> None:
     scene = SimulatedScene(motion, body_mesh(motion.body, around=64))
     write_calibration(rig, folder / "calib.toml")
     for camera in rig:
-        code = cv2.VideoWriter_fourcc(*"MJPG")
-        video = cv2.VideoWriter(str(folder / f"{camera.name}.avi"), code, motion.rate, camera.size)
-        for k in range(len(motion)):
-            grain = 0.0026 * 640 / camera.size[0]
-            video.write(cv2.cvtColor(textured_picture(scene, k, camera, grain=grain, seed=seed), cv2.COLOR_GRAY2BGR))
-        video.release()
+        grain = 0.0026 * 640 / camera.size[0]
+        images = (textured_picture(scene, k, camera, grain=grain, seed=seed) for k in range(len(motion)))
+        write_video(folder / f"{camera.name}.avi", images, motion.rate)
     start = {n: float(np.degrees(a)) for n, a in zip(motion.body.tree.coordinates, motion.angles[0])}
     told = ", ".join(f"{name} = {value + OFF.get(name, 0.0):.3f}" for name, value in start.items())
     (folder / "take.toml").write_text(

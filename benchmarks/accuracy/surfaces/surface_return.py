@@ -106,12 +106,21 @@ def in_view(
 
 def paths_of(file: Path, motion: Motion) -> NDArray:
     """(F, P, 3) [m] of a table of paths; NaN where a point is not there."""
+    ids, x = read_paths(file, len(motion), motion.rate)
+    out = np.full((len(motion), ids.max() + 1, 3), np.nan)
+    out[:, ids] = x
+    return out
+
+
+def read_paths(file: Path, count: int, rate: float) -> tuple[NDArray, NDArray]:
+    """Points of a table of paths by their ids (P,), and their places (F, P, 3) [m], NaN where a point is not there."""
     with file.open() as lines:
         rows = [[row[name] for name in ("time_s", "point", "x", "y", "z")] for row in csv.DictReader(lines)]
-    table = np.array(rows, float)
-    out = np.full((len(motion), int(table[:, 1].max()) + 1, 3), np.nan)
-    out[np.rint(table[:, 0] * motion.rate).astype(int), table[:, 1].astype(int)] = table[:, 2:]
-    return out
+    table = np.array(rows, float).reshape(-1, 5)
+    ids, column = np.unique(table[:, 1].astype(int), return_inverse=True)
+    x = np.full((count, len(ids), 3), np.nan)
+    x[np.rint(table[:, 0] * rate).astype(int), column] = table[:, 2:]
+    return ids, x
 
 
 def returns(paths: NDArray, motion: Motion, rig: Rig) -> tuple[int, int, int]:

@@ -17,16 +17,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 from tests.exporters.skeletons.character_file import write_character_glb
 
 from benchmarks.accuracy.surfaces.surface_body import frames_of, moving_arm
 from benchmarks.commands import printed
 from benchmarks.figures import amount, figure
 from benchmarks.scenes.bar_scene import draw_bar, wave_bar
-from benchmarks.scenes.textured import textured_picture
+from benchmarks.scenes.textured import textured_picture, write_video
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.fitting.initialization.from_points import clickable
@@ -155,7 +153,7 @@ def record_bar(folder: Path, rig: Rig, setup: Setup, places: int, seed: int) -> 
     ends = np.concatenate([lying, wave_bar(setup.bar, places, low=setup.low, high=setup.high, seed=seed)])
     for c, camera in enumerate(rig):
         images = [draw_bar(camera, at, radius=0.015 * setup.bar, seed=997 * c + f) for f, at in enumerate(ends)]
-        _write_video(folder / f"{camera.name}.avi", camera, 30.0, images)
+        write_video(folder / f"{camera.name}.avi", images, 30.0)
 
 
 def record(folder: Path, motion: Motion, rig: Rig, seed: int) -> None:
@@ -166,14 +164,7 @@ def record(folder: Path, motion: Motion, rig: Rig, seed: int) -> None:
     grain = 2.0 * float(np.linalg.norm(away)) / rig.cameras[1].matrix[0, 0]  # of the middle camera's pixels
     for camera in rig:
         images = [textured_picture(scene, k, camera, grain=grain, seed=seed) for k in range(len(motion))]
-        _write_video(folder / f"{camera.name}.avi", camera, motion.rate, images)
-
-
-def _write_video(path: Path, camera: Camera, rate: float, images: list[NDArray]) -> None:
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), rate, camera.size)
-    for image in images:
-        video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    video.release()
+        write_video(folder / f"{camera.name}.avi", images, motion.rate)
 
 
 def clicks(motion: Motion, rig: Rig, seed: int, steps: Sequence[int] = (0,)) -> str:
