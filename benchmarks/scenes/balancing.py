@@ -25,18 +25,21 @@ def trial_text(
 
     Parameters
     ----------
+    detector : "openpose", "mediapipe", or "" for no keypoints.
     cameras : names, or {name: tables of other sensors of that camera}.
     head : further lines of `[take]`.
     keypoints : further lines of each `[[keypoints]]`.
     """
     beside = cameras if isinstance(cameras, Mapping) else dict.fromkeys(cameras, "")
-    file, format_lines = _KEYPOINTS[detector]
+    file, format_lines = _KEYPOINTS.get(detector, ("", ""))
     text = f'[take]\nup = "z"\n{head}[calibration]\nfile = "{folder}/Calib_refined_static.toml"\nunit = "m"\n'
     for camera, sensors in beside.items():
         boxed = 'image = "letterboxed"\n' if camera in ("cam01", "cam02") else ""
         text += f'[[camera]]\nname = "{camera}"\nvideo = "{folder}/videos/{camera}.mp4"\n{boxed}'
-        text += f'[[keypoints]]\ncamera = "{camera}"\nfile = "{folder}/{file.format(camera)}"\n'
-        text += f"{format_lines}{keypoints}{sensors}"
+        if file:
+            text += f'[[keypoints]]\ncamera = "{camera}"\nfile = "{folder}/{file.format(camera)}"\n'
+            text += f"{format_lines}{keypoints}"
+        text += sensors
     return text
 
 

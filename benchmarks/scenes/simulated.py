@@ -52,6 +52,11 @@ def turned(rig: Rig, name: str, turn: NDArray) -> Rig:
     return Rig(tuple(c.with_pose(T @ c.T_camera_world) if c.name == name else c for c in rig))
 
 
+def to_and_fro(count: int, frames: int) -> NDArray:
+    """(F,) which of so many frames is shown in each, forwards and backwards until there are enough."""
+    return np.resize(np.concatenate([np.arange(count), np.arange(count - 2, 0, -1)]), frames)
+
+
 def rows_of(record: Keypoints) -> NDArray:
     """(F, K, 3) x, y [px] and confidence of the first person, 0 where a point is not seen: MediaPipe's array."""
     return np.nan_to_num(np.concatenate([record.points[:, 0], record.confidence[:, 0, :, None]], axis=-1))

@@ -17,6 +17,7 @@ import numpy as np
 
 from benchmarks.commands import begun, used
 from benchmarks.figures import LEFT_OUT, amount, figure, quick
+from benchmarks.scenes.simulated import to_and_fro
 from kinefit.bodies import load_body
 from kinefit.bodies.motion import Motion
 from kinefit.exporters.report.report import write_report
@@ -39,7 +40,7 @@ def write_long_take(folder: Path, frames: int, *, seed: int = 0) -> Path:
     rig = studio_rig(motion, cameras=2)
     folder.mkdir(parents=True, exist_ok=True)
     write_calibration(rig, folder / "calibration.toml")
-    order = np.resize(np.concatenate([np.arange(len(motion)), np.arange(len(motion) - 2, 0, -1)]), frames)
+    order = to_and_fro(len(motion), frames)
     names = KEYPOINT_SETS["MEDIAPIPE_33"]
     out = {c.name: np.zeros((frames, len(names), 3), np.float32) for c in rig}
     for start in range(0, frames, _PIECE):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.scenes.simulated import to_and_fro
 from kinefit.bodies import load_body
 from kinefit.bodies.motion import Motion
 from kinefit.geometry import se3
@@ -130,9 +131,7 @@ def _paths(kind: str, count: int, frames: int, random: np.random.Generator) -> l
 
 def along(motion: Motion, path: NDArray, frames: int) -> Motion:
     """A movement repeated to and fro, by a person who goes along a path."""
-    length = len(motion)
-    at = np.arange(frames) % (2 * length - 2)
-    at = np.where(at < length, at, 2 * length - 2 - at)
+    at = to_and_fro(len(motion), frames)
     T = motion.Ts_world_root[at].copy()
     if motion.name == "walk":
         T[:, [0, 2], 3] = 0.0
