@@ -20,6 +20,7 @@ from kinefit._jit import cache_directory
 _BASE = ("numpy==2.4.6", "scipy==1.17.1")
 _ROOT = Path(__file__).parents[2]
 _OWN_PATHS = "PYTHONPATH", "PYTHONHOME", "PYTHONSAFEPATH"  # of this process, not of the peer
+_LIMIT_S = 900.0  # [s] for the runner of a peer
 _ONE_THREAD = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -92,7 +93,7 @@ def environment(peer: str) -> tuple[Path | None, str]:
     return python, ""
 
 
-def run_peer(peer: str, folder: Path, timeout: float = 900.0) -> dict[str, Any]:
+def run_peer(peer: str, folder: Path) -> dict[str, Any]:
     """Run a peer's runner on an exchange folder, on one core and one thread.
 
     Returns
@@ -105,7 +106,7 @@ def run_peer(peer: str, folder: Path, timeout: float = 900.0) -> dict[str, Any]:
     record = PEERS[peer]
     variables = {name: value for name, value in os.environ.items() if name not in _OWN_PATHS}
     command = [str(python), "-m", f"benchmarks.peers.{record.runner}", str(folder.resolve()), *record.arguments]
-    found, reason, _ = measured(on_one_core(command), variables, timeout)
+    found, reason, _ = measured(on_one_core(command), variables, _LIMIT_S)
     return found or {"peer": peer, "reason": reason}
 
 

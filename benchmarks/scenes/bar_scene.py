@@ -121,13 +121,13 @@ CORNERS_LENGTH = 0.162
 
 
 def write_corners(
-    recording: Path, table: Path, *, pairs: Sequence[tuple[int, int]] = CORNERS, late: int = 0, seed: int = 0
+    recording: Path, table: Path, *, pairs: Sequence[tuple[int, int]] = CORNERS, late: int = 0
 ) -> None:
     """Write pairs of corners of a moved board, as four webcams saw them, as centroids of a bar in random order.
 
     The fourth webcam's images get the number of those `late` times before.
     """
-    rng, seen = np.random.default_rng(seed), dict[tuple[int, int, int], str]()
+    rng, seen = np.random.default_rng(0), dict[tuple[int, int, int], str]()
     with (recording / "calibration/extrinsic/xy.csv").open() as file:
         for row in csv.DictReader(file):
             at = int(row["sync_index"]), int(row["port"]), int(row["point_id"])

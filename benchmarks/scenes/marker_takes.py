@@ -279,14 +279,17 @@ def shares(column: NDArray, cut: Broken, take: Markers, labels: Sequence[str]) -
     return float(((named == own) & seen).sum() / seen.sum()), float(wrong.sum() / seen.sum())
 
 
-def _meetings(P: NDArray, rate: float, near: float = 0.06) -> Iterator[tuple[int, int, int]]:
+_NEAR = 0.06  # [m] at which two markers meet
+
+
+def _meetings(P: NDArray, rate: float) -> Iterator[tuple[int, int, int]]:
     """Frames in which two markers are nearest to each other, and nearer than 6 cm, having been farther apart."""
     for a in range(P.shape[1]):
         for b in range(a):
             d = np.linalg.norm(P[:, a] - P[:, b], axis=-1)
-            if not (np.nanmin(d, initial=np.inf) < near < np.nanmax(d, initial=0.0) / 1.5):
+            if not (np.nanmin(d, initial=np.inf) < _NEAR < np.nanmax(d, initial=0.0) / 1.5):
                 continue
-            close = np.nan_to_num(d, nan=np.inf) < near
+            close = np.nan_to_num(d, nan=np.inf) < _NEAR
             for rows in np.split(np.arange(len(d)), np.flatnonzero(np.diff(close.astype(int))) + 1):
                 if close[rows[0]]:
                     yield int(rows[np.argmin(d[rows])]), a, b

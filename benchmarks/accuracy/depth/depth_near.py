@@ -134,11 +134,11 @@ def errors(take: NearTake, motion: Motion) -> tuple[NDArray, NDArray]:
     return gap, lost > 0
 
 
-def near_take(seed: int, count: int = IMAGES) -> NearTake:
+def near_take(seed: int) -> NearTake:
     """Images and truth of a number."""
     rng = np.random.default_rng([seed, 32])
     body = _person(rng)
-    states = _states(body, rng, count)
+    states = _states(body, rng, IMAGES)
     roots, angles = np.array([s.T_world_root for s in states]), np.array([s.angles for s in states])
     truth = known_motion(body, RATE, roots, angles)
     T = np.diag([1.0, -1.0, -1.0, 1.0])  # at the origin, looks along -z
@@ -147,7 +147,7 @@ def near_take(seed: int, count: int = IMAGES) -> NearTake:
     folds = rng.normal(size=(3, 4)), rng.uniform(15.0, 60.0, (3, 4, 3)), rng.uniform(0.0, 6.3, (3, 4))
     fist = {"r": rng.random() < 0.35, "l": rng.random() < 0.35}
     images, seen = [], []
-    for k in range(count):
+    for k in range(IMAGES):
         mesh = _dressed(body, fist, folds)
         scene = SimulatedScene(truth, mesh, room)
         depth = measured_depth(scene, k, camera, SR305, rng)

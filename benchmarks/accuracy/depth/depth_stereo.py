@@ -25,6 +25,7 @@ from kinefit.solving.correspondences.occupancy.free_space import FreeSpace, Surf
 
 PAIRS = amount((1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14), (1, 5, 9))
 SQUARE = 0.025  # [m]
+REPEATS = 100  # of work whose median time is told
 
 
 def run() -> None:
@@ -32,10 +33,10 @@ def run() -> None:
     each(_board, _head, _skin, _space)
 
 
-def _cpu(work: Callable[[], object], repeats: int = 100) -> float:
+def _cpu(work: Callable[[], object]) -> float:
     """[ms] CPU time of a call, the median of many."""
     work()
-    return 1e3 * float(np.median([took(work)[1] for _ in range(repeats)]))
+    return 1e3 * float(np.median([took(work)[1] for _ in range(REPEATS)]))
 
 
 def _board() -> None:

@@ -57,9 +57,9 @@ class Robot:
         return self.body.markers("ROBOT").names
 
 
-def make_robot(folder: Path, seed: int = 0) -> Robot:
+def make_robot(folder: Path) -> Robot:
     """Body file and marker set of a six-axis arm with 30 markers."""
-    rng, body, rows, places = np.random.default_rng(seed), ['[body]\nname = "six_axis"'], [], {}
+    rng, body, rows, places = np.random.default_rng(0), ['[body]\nname = "six_axis"'], [], {}
     placed, at_rest = [], np.zeros(3)
     for k, (name, joint, axis, end, radius, count) in enumerate(LINKS):
         at_rest = at_rest + joint

@@ -52,9 +52,9 @@ def cyclist(seed: int, cameras: int, *, seconds: float = SECONDS, size: float = 
     )
 
 
-def jump(seed: int, cameras: int, *, seconds: float = JUMP_S, size: float = SIZE) -> GearTake:
+def jump(seed: int, cameras: int) -> GearTake:
     """The snowboarder's jump with the turn in it."""
-    return rendered_snowboarder(seed, seconds=seconds, cameras=cameras, rate=RATE, size=size, about_jump=True)
+    return rendered_snowboarder(seed, seconds=JUMP_S, cameras=cameras, rate=RATE, size=SIZE, about_jump=True)
 
 
 def riser(seed: int, cameras: int, *, seconds: float = SECONDS, size: float = SIZE) -> GearTake:

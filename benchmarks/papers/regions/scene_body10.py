@@ -241,9 +241,9 @@ class Run:
 
 def run_scene(
     scene: Scene, tracker: Callable[[Body, Rig, float], Any], *, every: int = 1, frames: Iterable[int] | None = None,
-    first: BodyState | None = None, kinds: Sequence[str] = ("depth",),
+    kinds: Sequence[str] = ("depth",),
 ) -> Run:  # fmt: skip
-    """Follow a scene from its truth (or `first`) on, every few frames.
+    """Follow a scene from its truth on, every few frames.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ def run_scene(
 
     chosen = list(range(0, len(scene), every) if frames is None else frames)
     made = tracker(scene.body, scene.rig, RATE / every)
-    made.start_at(scene.states[chosen[0]] if first is None else first)
+    made.start_at(scene.states[chosen[0]])
     add, ms, results = [], [], []
     for i in chosen:
         frames_at = scene.seen(i, kinds)

@@ -186,11 +186,11 @@ def scene(frames: int = 12, *, radial: bool = False) -> NDArray:
     return np.array(out)
 
 
-def write_depth(folder: Path, counts: NDArray, name: str = "{:04d}.png") -> Path:
+def write_depth(folder: Path, counts: NDArray) -> Path:
     """Depth images as 16-bit files in folder/depth."""
     (folder / "depth").mkdir()
     for i, image in enumerate(np.rint(counts).astype(np.uint16)):
-        cv2.imwrite(str(folder / "depth" / name.format(i)), image)
+        cv2.imwrite(str(folder / "depth" / f"{i:04d}.png"), image)
     return folder / "depth"
 
 
