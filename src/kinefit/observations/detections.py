@@ -84,6 +84,8 @@ class Detections:
         Probability that there is a face, 0 for points outside of the image and where no face is seen.
     times : (F,) [s], optional
         Time of each frame from the first, increasing; None: at the rate.
+    looked : (F,) bool, optional
+        Frames whose image was looked at; None: all.
 
     Raises
     ------
@@ -105,6 +107,7 @@ class Detections:
     times: NDArray | None = None
     face: NDArray | None = None
     face_confidence: NDArray | None = None
+    looked: NDArray | None = None
 
     def __post_init__(self) -> None:
         points, confidence = frozen(self.points), frozen(self.confidence)
@@ -141,7 +144,10 @@ class Detections:
         if times is not None:
             times = checked_times(times, f"camera {self.camera}", self.source)
             times = frozen(times, float, f"times of camera {self.camera}", points.shape[:1], self.source)
-        freeze(self, times=times)
+        looked = self.looked
+        if looked is not None:
+            looked = frozen(looked, bool, f"looks of camera {self.camera}", points.shape[:1], self.source)
+        freeze(self, times=times, looked=looked)
 
     def within(self, first: int, frames: int) -> Detections:
         """The detections padded to a longer video, as its frames from `first` on, without times; no one in the others.
@@ -156,7 +162,7 @@ class Detections:
             return np.pad(array, ((first, after), *[(0, 0)] * (array.ndim - 1)), constant_values=value)
 
         values: dict[str, float] = dict.fromkeys(("points", "lifted", "hands", "face"), np.nan)
-        values |= dict.fromkeys(("confidence", "hand_confidence", "face_confidence"), 0.0)
+        values |= dict.fromkeys(("confidence", "hand_confidence", "face_confidence"), 0.0) | {"looked": True}
         arrays = {name: getattr(self, name) for name in values}
         given: dict[str, Any] = {n: padded(array, values[n]) for n, array in arrays.items() if array is not None}
         starts = np.pad(self.mask_starts, (first * people, after * people), mode="edge")
@@ -225,7 +231,7 @@ class Detections:
             points, lifted = in_calibration(points, lifted, image_frame)
         return Keypoints(
             camera or self.camera, f"MEDIAPIPE_{len(names)}", names, self.rate, points, confidence,
-            time_offset=time_offset, source=self.source, lifted=lifted,
+            time_offset=time_offset, source=self.source, lifted=lifted, looked=self.looked,
         )
 
     def _faces(self, camera: str | None) -> tuple[NDArray, NDArray]:

@@ -18,6 +18,7 @@ the video's image, the centre of the first pixel is (0, 0):
     face (F, P, 478, 2)        float32 [px], optional: points of MEDIAPIPE_478; NaN where a face is not detected
     face_confidence (F, P, 478)     float32, 0..1, with face; 0 where a face is not detected
     times (F,)                 float64 [s], optional: when each frame is shown, from the first on; without: at the rate
+    looked (F,)                bool, optional: frames whose image was looked at; without: all
     mask_starts (F * P + 1,)   start of each mask in mask_runs, by frame, then person; two equal starts: no mask
 """
 
@@ -69,7 +70,7 @@ def read_detections(path: str | PathLike[str]) -> Detections:
         found = Detections(
             str(arrays["camera"]), float(arrays["rate"]), (width, height), arrays["points"], arrays["confidence"],
             arrays["mask_runs"], arrays["mask_starts"], str(file), arrays.get("lifted"),
-            *(arrays.get(name) for name in ("hands", "hand_confidence", "times", "face", "face_confidence")),
+            *(arrays.get(name) for name in ("hands", "hand_confidence", "times", "face", "face_confidence", "looked")),
         )
     except (KinefitError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
         raise FileError(f"its arrays do not fit together ({error})", file=file, remedy=again) from error
