@@ -6,14 +6,16 @@ person is tracked: the last landmarks give the region of the next image in which
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.images.detectors.box_detector import DetectedPerson, Models
+from kinefit.images.detectors.looking import SparseLooks
 from kinefit.images.detectors.roi import MIN_MASK, SIZE, Roi, Steady, cover, mask_runs, moved_mask, without_others
 from kinefit.observations import Detections
 
@@ -86,11 +88,34 @@ class Follower:
     _tracks: list[_DetectionTrack] = field(default_factory=list)
     _lost: list[_DetectionTrack] = field(default_factory=list)
     _frame: int = -1
+    _before: int = -1
     _columns: int = 0
 
-    def update(self, image: NDArray[np.uint8]) -> list[PersonDetection]:
-        """Detect the people in the next image (H, W, 3) uint8 RGB."""
-        self._frame += 1
+    def copy(self) -> Follower:
+        """A follower that goes on from here by itself."""
+        return replace(self, _tracks=list(self._tracks), _lost=list(self._lost))
+
+    @property
+    def sides(self) -> dict[int, float]:
+        """{column: side [px] of the region} of the people who were seen in the last image."""
+        return {t.column: t.steady.roi.side for t in self._tracks}
+
+    def between(self, before: Follower, image: NDArray[np.uint8], share: float) -> list[PersonDetection]:
+        """Detect those people in an image who were seen before it, as `before` knows them, and after it, as this does.
+
+        share : 0..1 of the way from the image before to the one after.
+        """
+        earlier, found = {t.column: t.steady.value for t in before._tracks}, []
+        for track in self._tracks:
+            ends = (1.0 - share) * earlier[track.column] + share * track.steady.value
+            others = [t.shape for t in self._tracks if t is not track and t.shape]
+            mask = self.masks or len(self._tracks) > 1
+            found.append(self._look_at(image, replace(track, steady=Steady.at(ends)), others=others, mask=mask))
+        return [one[1] for one in found if one is not None]
+
+    def update(self, image: NDArray[np.uint8], frames: int = 1) -> list[PersonDetection]:
+        """Detect the people in an image (H, W, 3) uint8 RGB, so many frames after the last one."""
+        self._before, self._frame = self._frame, self._frame + frames
         self._lost = [t for t in self._lost if self._frame - t.last <= _MAX_TIME_LOST * self.rate]
         crowd = len(self._tracks) > 1 or (self.people > 1 and self._is_due)  # their masks are needed
         detected = self._follow(image, self.masks or crowd)
@@ -105,7 +130,8 @@ class Follower:
     @property
     def _is_due(self) -> bool:
         """Whether a search of the whole image is due."""
-        return self._frame % max(round((_LOST_INTERVAL if self._lost else _SEARCH_INTERVAL) * self.rate), 1) == 0
+        every = max(round((_LOST_INTERVAL if self._lost else _SEARCH_INTERVAL) * self.rate), 1)
+        return self._frame // every > self._before // every
 
     def _follow(self, image: NDArray[np.uint8], mask: bool) -> list[tuple[_DetectionTrack, PersonDetection]]:
         """Update the tracks. Of two tracks of the same person, the one that moved less is kept."""
@@ -227,7 +253,7 @@ def _distance(a: _DetectionTrack, b: _DetectionTrack, points: slice) -> float:
 
 def detect_people(
     images: Iterable[NDArray[np.uint8]], models: Models, *, camera: str, rate: float, people: int = 3,
-    masks: bool = True, with_hands: _Adder | None = None, with_faces: _Adder | None = None,
+    masks: bool = True, with_hands: _Adder | None = None, with_faces: _Adder | None = None, looks: range | None = None,
 ) -> Detections:  # fmt: skip
     """Detect and track people in a video: keypoints and masks.
 
@@ -243,6 +269,9 @@ def detect_people(
         Whether masks are computed.
     with_hands, with_faces : callable, optional
         Adds hands, or faces, to the people in an image: a `HandFollower`, a `FaceFinder`.
+    looks : range, optional
+        Numbers of the images that are looked at for certain, others only where the motion or the people ask for it.
+        Default: all are looked at.
 
     Returns
     -------
@@ -250,16 +279,26 @@ def detect_people(
         One column for each person. A person who returns later than two seconds after leaving gets a new column.
         Detections of less than 0.2 s in total are dropped as false positives.
     """
-    follower = Follower(models, rate, people, masks)
-    frames: list[list[PersonDetection]] = []
     size = (0, 0)
-    for image in images:
-        size = (image.shape[1], image.shape[0])
-        detected = follower.update(image)
-        for add in filter(None, (with_hands, with_faces)):
-            detected = add(image, detected)
-        frames.append(detected)
-    times = Counter(s.column for frame in frames for s in frame)
+
+    def sized() -> Iterator[NDArray[np.uint8]]:
+        nonlocal size
+        for image in images:
+            size = (image.shape[1], image.shape[0])
+            yield image
+
+    def add(image: NDArray[np.uint8], detected: list[PersonDetection]) -> list[PersonDetection]:
+        for adder in filter(None, (with_hands, with_faces)):
+            detected = adder(image, detected)
+        return detected
+
+    follower, every = Follower(models, rate, people, masks), range(sys.maxsize)
+    seen = list(SparseLooks(follower, every if looks is None else looks, add).people(sized()))
+    looked = np.array([frame is not None for frame in seen], bool)
+    frames = [frame or [] for frame in seen]
+    times: Counter[int] = Counter()  # images, those before a look that were skipped included
+    for f, since in zip(np.flatnonzero(looked), np.diff(np.flatnonzero(looked), prepend=-1)):
+        times.update({s.column: int(since) for s in frames[f]})
     least = min(max(_MIN_FRAMES, round(_MIN_DURATION * rate)), len(frames) // 2)
     column = {c: k for k, c in enumerate(sorted(c for c in times if times[c] >= least))}
     points = np.full((len(frames), len(column), 33, 2), np.nan)
@@ -276,7 +315,7 @@ def detect_people(
     face, face_confidence = _stacked(frames, column, "face", (478,)) if with_faces else (None, None)
     return Detections(
         camera, rate, size, points, confidence, np.concatenate(runs), np.concatenate([[0], np.cumsum(counts)]), "",
-        lifted, hands, hand_confidence, None, face, face_confidence,
+        lifted, hands, hand_confidence, None, face, face_confidence, None if looked.all() else looked,
     )
 
 
