@@ -110,7 +110,7 @@ class Follower:
             ends = (1.0 - share) * earlier[track.column] + share * track.steady.value
             others = [t.shape for t in self._tracks if t is not track and t.shape]
             mask = self.masks or len(self._tracks) > 1
-            found.append(self._look_at(image, replace(track, steady=Steady.at(ends)), others=others, mask=mask))
+            found.append(self._look_at(image, replace(track, steady=Steady.at(ends), last=self._frame), others=others, mask=mask))
         return [one[1] for one in found if one is not None]
 
     def update(self, image: NDArray[np.uint8], frames: int = 1) -> list[PersonDetection]:
@@ -206,7 +206,8 @@ class Follower:
 
         The last masks of other people in the region are painted over: they attract the person's landmarks.
         """
-        roi = track.steady.roi
+        frames = 1 if track.points is None else max(self._frame - track.last, 1)
+        roi = track.steady.ahead(frames - 1).roi
         if not _MIN_ROI_PX < roi.side < _MAX_ROI_SIDES * max(image.shape[:2]):
             return None
         pose = self.models.pose(without_others(roi.crop(image, SIZE), roi, track.shape, others), mask=mask)
@@ -214,7 +215,7 @@ class Follower:
             return None
         points = roi.to_image(pose.points, SIZE)
         ends = roi.to_image(np.stack([pose.middle, pose.rim]), SIZE)
-        steady = track.steady.follow(ends) if track.points is not None else Steady.at(ends)
+        steady = track.steady.over(ends, frames) if track.points is not None else Steady.at(ends)
         runs = np.zeros(0, np.uint32)
         if self.masks and pose.mask is not None:
             runs = mask_runs(pose.mask, roi, image.shape[:2])

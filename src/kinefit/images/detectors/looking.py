@@ -1,6 +1,6 @@
 """Look at some images of a video, and at those between where the motion or the people ask for it.
 
-Detectors err alike in neighbouring images, so that every one of them tells little more than every third at 60 Hz. The
+Detectors err alike in neighbouring images, so that every one of them tells little more than every fourth at 60 Hz. The
 fit knows how a body moves on between two looks; points are not interpolated here.
 """
 
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from kinefit.images.detectors.detection import Follower, PersonDetection
 
-LOOK_RATE = 20.0
+LOOK_RATE = 15.0
 """[Hz] of the images that are looked at for certain, about."""
 
-_MAX_MISS = 0.1  # [sides of the region] off where three looks lead: noise alone is 0.03 to 0.05, of a third at 60 Hz
+_MAX_MISS = 0.1  # [sides of the region] off where three looks lead: noise alone is 0.02 to 0.05, 0.09 at most
 _MAX_MIDDLE_MISS = 0.05  # [sides of the region] of the middle image off a parabola; noise alone is 0.01 to 0.02
 _FAST_POINTS = 3  # landmarks that are that far off: a hand has four, a foot three
 _MIN_CONFIDENCE = 0.5  # of these, in all looks
