@@ -102,6 +102,9 @@ AREAS: dict[str, dict[str, str]] = {
         "people_simulated": "people who cross, shake hands, hide each other, leave and come back",
         "people_rough": "the same as detectors see people in real rooms: missed, doubled, merged, behind furniture",
     },
+    "networks": {
+        "looking": "detection that skips images: time, and the motion beside that of every image",
+    },
     "hands": {
         "hands_simulated": "random motions of fingers before four cameras, by the command; speed beside the humanoid",
         "hands_real": "a seated person with both hands before four cameras, each of them held out of the fit",

@@ -75,7 +75,8 @@ def test_who_leaves_or_comes_is_seen_in_as_many_images_as_with_every_look(draw, 
 def test_a_skipped_image_is_not_one_without_the_person(draw, models):
     """A person is kept who is seen for a fifth of a second, whatever the number of looks in it."""
     pictures = [draw()] * 30 + [draw((100, 120, 30))] * 14 + [draw()] * 40
-    assert detect(pictures, models, range(0, 1000, STEP)).points.shape[1] == detect(pictures, models).points.shape[1] == 1
+    for looks in (None, range(0, 1000, STEP)):
+        assert detect(pictures, models, looks).points.shape[1] == 1
 
 
 def test_two_people_stay_in_their_columns(draw, models):

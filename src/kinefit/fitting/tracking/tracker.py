@@ -281,7 +281,7 @@ class Tracker:
         return self._fit.run(scene, held, measurements, None if held is None else self._known(time))
 
     def between(self, time: float) -> FrameResult | None:
-        """The body at a time [s] when no sensor looked, as it moved on; nothing of it is remembered. None until a start."""
+        """The body at a time [s] when no sensor looked, as it moved on; None until a start. Nothing is remembered."""
         if self._prediction.state is None or self._time is None:
             return None
         steps = self._direction * (time - self._time) * self.rate

@@ -110,7 +110,8 @@ class Follower:
             ends = (1.0 - share) * earlier[track.column] + share * track.steady.value
             others = [t.shape for t in self._tracks if t is not track and t.shape]
             mask = self.masks or len(self._tracks) > 1
-            found.append(self._look_at(image, replace(track, steady=Steady.at(ends), last=self._frame), others=others, mask=mask))
+            there = replace(track, steady=Steady.at(ends), last=self._frame)
+            found.append(self._look_at(image, there, others=others, mask=mask))
         return [one[1] for one in found if one is not None]
 
     def update(self, image: NDArray[np.uint8], frames: int = 1) -> list[PersonDetection]:
@@ -298,8 +299,8 @@ def detect_people(
     looked = np.array([frame is not None for frame in seen], bool)
     frames = [frame or [] for frame in seen]
     times: Counter[int] = Counter()  # images, those before a look that were skipped included
-    for f, since in zip(np.flatnonzero(looked), np.diff(np.flatnonzero(looked), prepend=-1)):
-        times.update({s.column: int(since) for s in frames[f]})
+    for look, since in zip(np.flatnonzero(looked), np.diff(np.flatnonzero(looked), prepend=-1)):
+        times.update({s.column: int(since) for s in frames[look]})
     least = min(max(_MIN_FRAMES, round(_MIN_DURATION * rate)), len(frames) // 2)
     column = {c: k for k, c in enumerate(sorted(c for c in times if times[c] >= least))}
     points = np.full((len(frames), len(column), 33, 2), np.nan)

@@ -170,7 +170,7 @@ def detect(
     if not todo:
         return []
     files = networks(progress, tell, settings.quality or QUALITY)
-    if files.name in ("auto", "best") and len(jobs) == 1:  # depths of one camera gain by it; several give the same motion
+    if files.name in ("auto", "best") and len(jobs) == 1:  # depths of one camera gain; several give the same motion
         files = replace(files, mirrored=True)
     s = settings
     full = DetectionSettings(PEOPLE if s.people is None else s.people, bool(s.masks), bool(s.hands), bool(s.face))
@@ -211,7 +211,7 @@ def seconds_of(job: DetectionJob, video: Video) -> tuple[int, int]:
 
 
 def _looks(jobs: Sequence[DetectionJob]) -> dict[DetectionJob, range]:
-    """Images of each video, from the first of those looked through, that are looked at for certain: all cameras' at once.
+    """Images of each video, from the first one looked through, that are looked at for certain: of all cameras at once.
 
     Empty, so that all are looked at, where the cameras do not take their images together, or that is not known.
     """

@@ -1,0 +1,1 @@
+"""The networks of the detector, and what other programs estimated."""
