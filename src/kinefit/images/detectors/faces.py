@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.images.detectors.box_detector import BoxDetector, DetectedPerson, Models, interpreter
-from kinefit.images.detectors.detection import PersonDetection
+from kinefit.images.detectors.following import PersonDetection
 from kinefit.images.detectors.roi import SIZE, Roi, is_inside
 
 FACES_NEAR, FACES_FAR = "face_detection_short_range.tflite", "face_detection_full_range_sparse.tflite"

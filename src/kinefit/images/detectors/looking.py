@@ -8,13 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from kinefit.images.detectors.detection import Follower, PersonDetection
+from kinefit.images.detectors.following import Follower, PersonDetection
 
 LOOK_RATE = 15.0
 """[Hz] of the images that are looked at for certain, about."""
@@ -23,6 +21,8 @@ _MAX_MISS = 0.1  # [sides of the region] off where three looks lead: noise alone
 _MAX_MIDDLE_MISS = 0.05  # [sides of the region] of the middle image off a parabola; noise alone is 0.01 to 0.02
 _FAST_POINTS = 3  # landmarks that are that far off: a hand has four, a foot three
 _MIN_CONFIDENCE = 0.5  # of these, in all looks
+
+Adder = Callable[[NDArray[np.uint8], list[PersonDetection]], list[PersonDetection]]
 
 
 @dataclass
@@ -39,7 +39,7 @@ class SparseLooks:
 
     follower: Follower
     frames: range
-    add: Callable[[NDArray[np.uint8], list[PersonDetection]], list[PersonDetection]]
+    add: Adder
     _history: list[dict[int, PersonDetection]] = field(default_factory=list)  # of the last looks, a step apart
 
     def people(self, images: Iterable[NDArray[np.uint8]]) -> Iterator[list[PersonDetection] | None]:

@@ -55,6 +55,7 @@ class DetectionJob:
         Of a video that is a folder of images.
     seconds : (start, stop) [s] of the video that are looked through; default: all of it
     time_offset : float [s], when its first image is taken on the clock of all cameras; None where that is unknown
+    looks : images, from the first one looked through, that are looked at for certain; default: by the quality
     """
 
     camera: str
@@ -63,6 +64,7 @@ class DetectionJob:
     rate: float | None = None
     seconds: tuple[float, float] | None = None
     time_offset: float | None = 0.0
+    looks: range | None = None
 
 
 @dataclass(frozen=True)
@@ -180,7 +182,7 @@ def detect(
     def work(job: DetectionJob, step: Step) -> None:
         key = f"{keys[job]} {_settings(full, job.seconds)}"
         key += f"{' mirrored=True' * files.mirrored} quality={files.name}"
-        _look_through(job, files, full, key, step, threads, looks.get(job))
+        _look_through(replace(job, looks=looks.get(job)), files, full, key, step, threads)
 
     with hushed():
         Models(files.folder, landmarks=files.landmarks)
@@ -231,9 +233,8 @@ def _looks(jobs: Sequence[DetectionJob]) -> dict[DetectionJob, range]:
 
 
 def _look_through(
-    job: DetectionJob, files: Networks, settings: DetectionSettings, key: str, tell: Step, threads: int,
-    looks: range | None = None,
-) -> None:  # fmt: skip
+    job: DetectionJob, files: Networks, settings: DetectionSettings, key: str, tell: Step, threads: int
+) -> None:
     from kinefit.exporters.motion_file import write_detections
     from kinefit.images.detectors.box_detector import Models
     from kinefit.images.detectors.detection import detect_people
@@ -254,7 +255,7 @@ def _look_through(
             counted(video.frames(first, last)), models, camera=job.camera, rate=video.rate,
             people=settings.people or 0, masks=bool(settings.masks),
             with_hands=HandFollower(HandModels(files.folder, threads)) if settings.hands else None,
-            with_faces=FaceFinder(FaceModels(files.folder, threads)) if settings.face else None, looks=looks,
+            with_faces=FaceFinder(FaceModels(files.folder, threads)) if settings.face else None, looks=job.looks,
         )  # fmt: skip
         times = video.times if video.unevenness else None
         found = replace(found.within(first, len(video)), times=times, source=str(job.video))
