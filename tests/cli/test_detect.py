@@ -285,7 +285,7 @@ def test_the_licence_is_shown_when_the_networks_are_fetched(monkeypatch, tmp_pat
     detecting.networks(None, pytest.fail)  # nothing is said when they are there already
 
 
-@pytest.mark.parametrize(("quality", "file"), [("balanced", "full"), ("best", "heavy")])
+@pytest.mark.parametrize(("quality", "file"), [("balanced", "full"), ("auto", "heavy"), ("best", "heavy")])
 def test_a_quality_is_a_landmark_network(monkeypatch, tmp_path, quality, file):
     monkeypatch.undo()
     pytest.importorskip("ai_edge_litert")

@@ -134,7 +134,7 @@ def _skin() -> None:
 
 def _gestures(folder: Path, port: int, models: object) -> tuple[NDArray, float]:
     """(N, 2): 0 for the face and 1 for a hand, and how far it is from where the networks see it; NaN for unseen."""
-    from kinefit.images.detectors.detection import Follower
+    from kinefit.images.detectors.following import Follower
     from kinefit.images.detectors.skin import SkinTracker, find_face
     from kinefit.readers.videos.video import Video
 

@@ -36,7 +36,8 @@ Examples:
 )
 @click.option(
     "--quality", type=click.Choice(list(detecting.QUALITIES)),
-    help="Landmark network; best takes 3 times as long as balanced, 6 times for one video.  "
+    help="Landmark network; best takes 3 times as long as balanced, 6 times for one video. auto is best that skips "
+    "images above 22 Hz where the motion is smooth.  "
     "[default: as in existing results, or best]",
 )
 @click.option(
@@ -57,7 +58,7 @@ def detect(
     inputs: tuple[Path, ...], people: int, masks: bool, hands: bool | None, face: bool | None, quality: str | None,
     network: Path | None, detector: Path | None, calibrate: bool, force: bool, out: Path | None,
 ) -> None:
-    """Detect people, their keypoints and their masks in every image of the videos.
+    """Detect people, their keypoints and their masks in the images of the videos.
 
     Give one TAKE (.toml), or VIDEO files. `kinefit track` uses the detections for a take without [[keypoints]]. Videos
     with results are skipped; Ctrl-C keeps the finished videos. The command needs the extra `detect`:

@@ -76,9 +76,10 @@ def write_detections(detections: Detections, path: str | PathLike[str], *, key: 
         for name in ("points", "confidence", "lifted", "hands", "hand_confidence", "face", "face_confidence")
         if (array := getattr(detections, name)) is not None
     }  # fmt: skip
-    keys = ("camera", "rate", "size", "mask_runs", "mask_starts", *(() if detections.times is None else ("times",)))
+    keys = ["camera", "rate", "size", "mask_runs", "mask_starts"]
+    keys += [name for name in ("times", "looked") if getattr(detections, name) is not None]
     if detections.network or detections.names != MEDIAPIPE_33:
-        keys = (*keys, "names", "keypoint_set", "network")
+        keys += ["names", "keypoint_set", "network"]
     arrays |= {"key": key, **{name: getattr(detections, name) for name in keys}}
     _write(path, "a file of detections", detections_format, arrays)
 

@@ -103,6 +103,8 @@ class Detections:
         Of the points.
     network : str
         File of a network of one's own; "" for the built-in one.
+    looked : (F,) bool, optional
+        Frames whose image was looked at; None: all.
 
     Raises
     ------
@@ -127,6 +129,7 @@ class Detections:
     keypoint_set: str = "MEDIAPIPE_33"
     names: tuple[str, ...] = MEDIAPIPE_33
     network: str = ""
+    looked: NDArray | None = None
 
     def __post_init__(self) -> None:
         points, confidence = frozen(self.points), frozen(self.confidence)
@@ -167,7 +170,10 @@ class Detections:
         if times is not None:
             times = checked_times(times, f"camera {self.camera}", self.source)
             times = frozen(times, float, f"times of camera {self.camera}", points.shape[:1], self.source)
-        freeze(self, times=times)
+        looked = self.looked
+        if looked is not None:
+            looked = frozen(looked, bool, f"looks of camera {self.camera}", points.shape[:1], self.source)
+        freeze(self, times=times, looked=looked)
 
     def within(self, first: int, frames: int) -> Detections:
         """The detections padded to a longer video, as its frames from `first` on, without times; no one in the others.
@@ -182,7 +188,7 @@ class Detections:
             return np.pad(array, ((first, after), *[(0, 0)] * (array.ndim - 1)), constant_values=value)
 
         values: dict[str, float] = dict.fromkeys(("points", "lifted", "hands", "face"), np.nan)
-        values |= dict.fromkeys(("confidence", "hand_confidence", "face_confidence"), 0.0)
+        values |= dict.fromkeys(("confidence", "hand_confidence", "face_confidence"), 0.0) | {"looked": True}
         arrays = {name: getattr(self, name) for name in values}
         given: dict[str, Any] = {n: padded(array, values[n]) for n, array in arrays.items() if array is not None}
         starts = np.pad(self.mask_starts, (first * people, after * people), mode="edge")
@@ -254,7 +260,7 @@ class Detections:
             points, lifted = in_calibration(points, lifted, image_frame)
         return Keypoints(
             camera or self.camera, keypoint_set, names, self.rate, points, confidence,
-            time_offset=time_offset, source=self.source, lifted=lifted,
+            time_offset=time_offset, source=self.source, lifted=lifted, looked=self.looked,
         )
 
     def _faces(self, camera: str | None) -> tuple[NDArray, NDArray]:

@@ -7,7 +7,7 @@ import pytest
 
 from kinefit.errors import AssetError
 from kinefit.images.detectors.box_detector import Models
-from kinefit.images.detectors.detection import PersonDetection, detect_people
+from kinefit.images.detectors.detection import detect_people
 from kinefit.images.detectors.faces import (
     HANDS_ONLY_COLUMN,
     HandFollower,
@@ -16,6 +16,7 @@ from kinefit.images.detectors.faces import (
     around_hand,
     around_wrist,
 )
+from kinefit.images.detectors.following import PersonDetection
 from kinefit.images.detectors.layouts import BLAZEPOSE
 from kinefit.images.detectors.roi import Roi
 from kinefit.readers import assets

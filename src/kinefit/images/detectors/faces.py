@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.images.detectors.box_detector import BoxDetector, DetectedPerson, Models, interpreter
-from kinefit.images.detectors.detection import PersonDetection
+from kinefit.images.detectors.following import PersonDetection
 from kinefit.images.detectors.layouts import BLAZEPOSE, SIZE, PointLayout
 from kinefit.images.detectors.roi import Roi, is_inside
 

@@ -254,6 +254,18 @@ class Steady:
         """Start the filter at points (2, 2) [px]."""
         return cls(points, points, np.zeros_like(points))
 
+    def over(self, points: NDArray, frames: int) -> Steady:
+        """Filter the points (2, 2) [px] of an image so many frames later, evenly on the way there in those between."""
+        out = self
+        for k in range(frames):
+            out = out.follow(self.raw + (k + 1) / frames * (points - self.raw))
+        return out
+
+    def ahead(self, frames: int) -> Steady:
+        """The filter so many frames later, as its points move on."""
+        radius = float(np.linalg.norm(self.raw[1] - self.raw[0]))
+        return self.over(self.raw + frames * 2 * radius * _PERIOD * self.speed, frames)
+
     def follow(self, points: NDArray) -> Steady:
         """Filter the points (2, 2) [px] of the next image."""
         radius = max(float(np.linalg.norm(points[1] - points[0])), 1e-6)

@@ -21,6 +21,7 @@ the video's image, the centre of the first pixel is (0, 0):
     face (F, P, 478, 2)        float32 [px], optional: points of MEDIAPIPE_478; NaN where a face is not detected
     face_confidence (F, P, 478)     float32, 0..1, with face; 0 where a face is not detected
     times (F,)                 float64 [s], optional: when each frame is shown, from the first on; without: at the rate
+    looked (F,)                bool, optional: frames whose image was looked at; without: all
     mask_starts (F * P + 1,)   start of each mask in mask_runs, by frame, then person; two equal starts: no mask
 """
 
@@ -70,7 +71,7 @@ def read_detections(path: str | PathLike[str]) -> Detections:
         raise FileError(problem, file=file, remedy=again) from error
     try:
         width, height = (int(n) for n in arrays["size"])
-        optional = ("lifted", "hands", "hand_confidence", "times", "face", "face_confidence")
+        optional = ("lifted", "hands", "hand_confidence", "times", "face", "face_confidence", "looked")
         more: dict[str, Any] = {name: arrays.get(name) for name in optional}
         if "names" in arrays:
             more |= {"keypoint_set": str(arrays["keypoint_set"]), "names": tuple(map(str, arrays["names"]))}

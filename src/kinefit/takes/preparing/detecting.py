@@ -33,12 +33,14 @@ if TYPE_CHECKING:
 PEOPLE = 3
 """How many people are followed at most in one camera, by default."""
 
-QUALITIES = {"balanced": "pose_landmark_full.tflite", "best": "pose_landmark_heavy.tflite"}
-"""Landmark networks: the larger, the nearer to the joints, and the slower."""
+_LARGE = "pose_landmark_heavy.tflite"
+QUALITIES = {"balanced": "pose_landmark_full.tflite", "auto": _LARGE, "best": _LARGE}
+"""Landmark networks: the larger, the nearer to the joints, and the slower. "auto" does not look at every image."""
 
 QUALITY = "best"
 """Of new detections, where none is asked for."""
 
+_MAX_STEP_ERROR = 0.02  # [frames] between images that two cameras take together
 _METHOD = "3"  # raise it when the detector gives other numbers for the same video
 
 
@@ -55,6 +57,8 @@ class DetectionJob:
     rate : float [Hz], optional
         Of a video that is a folder of images.
     seconds : (start, stop) [s] of the video that are looked through; default: all of it
+    time_offset : float [s], when its first image is taken on the clock of all cameras; None where that is unknown
+    looks : images, from the first one looked through, that are looked at for certain; default: by the quality
     """
 
     camera: str
@@ -62,6 +66,8 @@ class DetectionJob:
     file: Path
     rate: float | None = None
     seconds: tuple[float, float] | None = None
+    time_offset: float | None = 0.0
+    looks: range | None = None
 
 
 @dataclass(frozen=True)
@@ -149,11 +155,14 @@ class Networks:
 def jobs_of_take(take: Take) -> list[DetectionJob]:
     """Every camera of a take that has a video; TakeError where none has."""
     from kinefit.readers.landmarks.detections import detections_file
+    from kinefit.readers.take.cameras import is_uncalibrated
 
-    rate = _rate(take) if take.frames else 0.0
+    rate, clocks_unknown = _rate(take) if take.frames else 0.0, is_uncalibrated(take)
     found = [
-        DetectionJob(c.name, c.video, detections_file(take.path, c.name), take.rate, _seconds(take, c, rate))
-        for c in take.cameras if c.video is not None
+        DetectionJob(
+            c.name, c.video, detections_file(take.path, c.name), take.rate, _seconds(take, c, rate),
+            None if clocks_unknown else c.time_offset,
+        ) for c in take.cameras if c.video is not None
     ]  # fmt: skip
     if not found:
         raise TakeError(
@@ -213,12 +222,13 @@ def detect(
     s = settings
     full = DetectionSettings(PEOPLE if s.people is None else s.people, bool(s.masks), bool(s.hands), bool(s.face))
     threads = max(cores() // len(todo), 1)  # cameras run side by side; what cores are left help them
+    looks = _looks(jobs) if files.name == "auto" else {}
 
     def work(job: DetectionJob, step: Step) -> None:
         key = f"{keys[job]} {_settings(full, job.seconds)}"
         key += f"{' mirrored=True' * files.mirrored} quality={files.name}"
         key += f" detector={wanted['detector']}" if files.detector else ""
-        _look_through(job, files, full, key, step, threads)
+        _look_through(replace(job, looks=looks.get(job)), files, full, key, step, threads)
 
     with hushed():
         models = files.models()
@@ -264,6 +274,26 @@ def seconds_of(job: DetectionJob, video: Video) -> tuple[int, int]:
     return first, stop
 
 
+def _looks(jobs: Sequence[DetectionJob]) -> dict[DetectionJob, range]:
+    """Images of each video, from the first one looked through, that are looked at for certain: of all cameras at once.
+
+    Empty, so that all are looked at, where the cameras do not take their images together, or that is not known.
+    """
+    from kinefit.images.detectors.looking import LOOK_RATE
+    from kinefit.readers.videos.video import Video
+
+    rates, firsts = [], []
+    for job in jobs:
+        with Video(job.video, rate=job.rate) as video:
+            ahead = np.nan if job.time_offset is None or video.unevenness else job.time_offset * video.rate
+            rates.append(video.rate)
+            firsts.append(ahead + seconds_of(job, video)[0])  # on the common clock, in steps
+    step, off = max(round(rates[0] / LOOK_RATE), 1), np.subtract(firsts, np.rint(firsts))
+    if step == 1 or not (np.allclose(rates, rates[0], rtol=1e-3) and np.all(np.abs(off) < _MAX_STEP_ERROR)):
+        return {}
+    return {job: range(-round(first) % step, sys.maxsize, step) for job, first in zip(jobs, firsts)}
+
+
 def _look_through(
     job: DetectionJob, files: Networks, settings: DetectionSettings, key: str, tell: Step, threads: int
 ) -> None:
@@ -288,6 +318,7 @@ def _look_through(
             people=settings.people or 0, masks=bool(settings.masks),
             with_hands=HandFollower(HandModels(folder, threads), layout=models.layout) if hands else None,
             with_faces=FaceFinder(FaceModels(folder, threads), models.layout) if settings.face else None,
+            looks=job.looks,
         )  # fmt: skip
         times = video.times if video.unevenness else None
         found = replace(found.within(first, len(video)), times=times, source=str(job.video))
