@@ -19,6 +19,12 @@ AREAS: dict[str, dict[str, str]] = {
         "channels": "what is found of the errors of markers and of a range sensor",
         "posture": "hips, spine and pelvis: what the posture prior tells",
     },
+    "networks": {
+        "networks_decode": "points of ONNX networks beside the published decoding; cost beside the network's own run",
+        "networks_sigma": "standard deviations by confidence, in cameras that were held out",
+        "second_opinion": "poses that another program made of a video: alone, and with the video, against markers",
+        "looking": "detection that skips images: time, and the motion beside that of every image",
+    },
     "depth": {
         "depth_surfaces": "closest points on tapered elliptical cylinders",
         "depth_rendering": "drawing a body, and what depth sensors would have seen",
@@ -101,9 +107,6 @@ AREAS: dict[str, dict[str, str]] = {
         "people_return": "people who leave and come back elsewhere, simulated and in four real videos",
         "people_simulated": "people who cross, shake hands, hide each other, leave and come back",
         "people_rough": "the same as detectors see people in real rooms: missed, doubled, merged, behind furniture",
-    },
-    "networks": {
-        "second_opinion": "poses that another program made of a video: alone, and with the video, against markers",
     },
     "hands": {
         "hands_simulated": "random motions of fingers before four cameras, by the command; speed beside the humanoid",

@@ -125,3 +125,8 @@ def test_a_sensor_of_ones_own(seed, capsys):
     assert np.median(errors["one camera and the rope"]) < 0.9 * np.median(errors["one camera"])
     assert np.median(errors["one camera and the rope"][taut]) < 0.5 * np.median(errors["one camera"][taut])
     assert "m is the truth" in capsys.readouterr().out
+
+
+def test_a_network_of_ones_own(tmp_path, capsys):
+    off, confidence = example("08_own_network").main(tmp_path / "discs.colours")
+    assert off.max() < 2.0 and confidence.min() > 0.8 and "LWrist" in capsys.readouterr().out

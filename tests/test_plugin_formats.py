@@ -35,7 +35,7 @@ from kinefit.takes.batch.results import FORMATS, MotionFormat, check_formats, wr
 MODULE = next(block.text for block in blocks("own-sensor", "python") if "MotionFormat(" in block.text)
 PROJECT = next(block.text for block in blocks("own-sensor", "toml") if "kinefit.exporters" in block.text)
 NAMED = r"the plug-in kinefit-formats 0\.1 \(entry point '{}' of kinefit\.{}\)"
-READER, EXPORTER = NAMED.format(r"keypoints\.dlc", "readers"), NAMED.format("angles", "exporters")
+READER, EXPORTER = NAMED.format(r"keypoints\.lab", "readers"), NAMED.format("angles", "exporters")
 MORE = '''
 from kinefit import Camera, Markers, Rig
 
@@ -63,25 +63,23 @@ POINTS = '"markers.lines" = "kinefit_formats:LINES"\n"calibration.plain" = "kine
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     site = Site(tmp_path_factory.mktemp("site") / "packages")
-    site.install(MODULE + MORE, PROJECT.replace('"keypoints.dlc"', POINTS + '"keypoints.dlc"'))
+    site.install(MODULE + MORE, PROJECT.replace('"keypoints.lab"', POINTS + '"keypoints.lab"'))
     return site
 
 
 def write_tables(take):
-    """Keypoints of each camera of a take as DeepLabCut writes them, in place of its own."""
+    """Keypoints of each camera of a take as the laboratory writes them, in place of its own."""
     text = take.read_text()
     rig = read_calibration(read_take(take).calibration.file)
     for file in {*re.findall(r'^file = "(.+\.npy)"', text, re.M)}:
         (take.parent / file).unlink()
     names = KEYPOINT_SETS["COCO_17"]
     for record in simulate_keypoints(squat_and_wave(), rig, "COCO_17"):
-        heads = [["scorer"], ["bodyparts"], ["coords"]]
-        for name in names:
-            heads = [[*row, *cells] for row, cells in zip(heads, (["net"] * 3, [name] * 3, ["x", "y", "likelihood"]))]
+        head = ",".join(["points", *(name for name in names for _ in range(3))])
         cells = np.concatenate([record.points, record.confidence[..., None]], axis=-1)[:, 0].reshape(len(record), -1)
-        rows = [",".join(row) for row in heads] + [f"{k}," + ",".join(map(str, row)) for k, row in enumerate(cells)]
+        rows = [head] + [f"{k}," + ",".join(map(str, row)) for k, row in enumerate(cells)]
         (take.parent / f"{record.camera}.csv").write_text("\n".join(rows) + "\n")
-    entries = [f'[[keypoints]]\ncamera = "{name}"\nfile = "{name}.csv"\nformat = "dlc"\n' for name in rig.names]
+    entries = [f'[[keypoints]]\ncamera = "{name}"\nfile = "{name}.csv"\nformat = "lab"\n' for name in rig.names]
     take.write_text("\n".join([text.partition("[[keypoints]]")[0], *entries]))
 
 
@@ -146,7 +144,8 @@ def test_formats_of_another_distribution_go_from_init_to_export(site, recording,
     assert code == 0, said
     text = recording.read_text()
     assert text.count("[[keypoints]]") == 4 and "COCO_17, 4 cameras: used" in said
-    assert re.search(r'^format = "dlc" +# sure: of the plug-in kinefit-formats 0\.1: tables of DeepLabCut$', text, re.M)
+    comment = r"sure: of the plug-in kinefit-formats 0\.1: tables of the laboratory"
+    assert re.search(rf'^format = "lab" +# {comment}$', text, re.M)
     code, said = site.kinefit("check", recording)
     assert code == 0, said
     out = tmp_path / "out"
@@ -154,7 +153,7 @@ def test_formats_of_another_distribution_go_from_init_to_export(site, recording,
     assert code == 0 and "kinefit-formats 0.1" in said, said
     found = read_motion(out / "motion.npz")
     assert found.provenance["plugins"] == ["kinefit-formats 0.1"]
-    assert found.provenance["keypoints"][0]["format"] == "dlc"
+    assert found.provenance["keypoints"][0]["format"] == "lab"
     truth = squat_and_wave()
     knee = found.body.tree.coordinates.index("knee_angle_r")
     assert np.median(np.abs(found.angles[:, knee] - truth.angles[: len(found), knee])) < np.radians(6.0)
@@ -178,7 +177,7 @@ def test_keypoints_of_a_plugin_are_taken_to_the_calibration_and_the_clock(here, 
     plain = read_keypoints(file, camera="cam01", rate=30.0)
     assert plain.keypoint_set == "COCO_17" and plain.time_offset == 0.0
     turned = ImageFrame.rotated((640, 480), 90)
-    moved = read_keypoints(file, format="dlc", camera="cam01", rate=30.0, time_offset=0.5, image_frame=turned)
+    moved = read_keypoints(file, format="lab", camera="cam01", rate=30.0, time_offset=0.5, image_frame=turned)
     assert moved.time_offset == 0.5
     np.testing.assert_allclose(moved.points, turned.to_calibration(plain.points))
 
@@ -235,7 +234,7 @@ def test_a_reader_that_fails(here, recording, pair, words):
     here(pair)
     file = recording.parent / "cam01.csv"
     with pytest.raises(PluginError, match=words) as caught:
-        read_keypoints(file, format="dlc", camera="cam01", rate=30.0)
+        read_keypoints(file, format="lab", camera="cam01", rate=30.0)
     assert re.search(READER, caught.value.problem) and Path(caught.value.file) == file
     notes = [note.text for note in guess_take(recording.parent).notes if note.about == "files"]
     assert any(re.search(f"{READER} ", note) for note in notes)
@@ -253,7 +252,7 @@ def test_a_format_that_cannot_be_asked_stops_only_files_that_no_other_reads(here
     with pytest.raises(PluginError, match=NAMED.format(r"markers\.lines", "readers")) as caught:
         read_markers(tmp_path / "walk.lines")
     assert Path(caught.value.file) == tmp_path / "walk.lines"
-    here(('return file.readline().startswith("scorer,")', "return 1"))
+    here(('return file.readline().startswith("points,")', "return 1"))
     with pytest.raises(PluginError, match=f"{READER} returned a int from `recognise`, not a bool"):
         read_keypoints(file, camera="cam01", rate=30.0)
     assert "[[keypoints]]" not in guess_take(recording.parent).text
@@ -278,16 +277,16 @@ def test_a_reader_of_calibrations_that_fails(here, tmp_path, pair, words):
 
 
 def test_a_format_of_keypoints_that_is_not_installed(recording):
-    words = "no keypoint format 'dlc'; there are: openpose, mediapipe, caliscope"
+    words = "no keypoint format 'lab'; there are: openpose, alphapose, mmpose, mediapipe"
     with pytest.raises(TakeError, match=f"{words}.*install the plug-in that adds this keypoint format\\."):
         read_take(recording)
-    noted = 'format = "dlc"   # sure: of the plug-in kinefit-formats 0.1: tables of DeepLabCut'
-    recording.write_text(recording.read_text().replace('format = "dlc"', noted))
+    noted = 'format = "lab"   # sure: of the plug-in kinefit-formats 0.1: tables of the laboratory'
+    recording.write_text(recording.read_text().replace('format = "lab"', noted))
     with pytest.raises(TakeError, match=r"-m pip install kinefit-formats\.") as caught:
         read_take(recording)
     assert caught.value.file == recording and caught.value.place == "[[keypoints]] 1"
-    with pytest.raises(ObservationError, match="no keypoint format 'dlc'.*install the plug-in"):
-        read_keypoints(recording.parent / "cam01.csv", format="dlc", camera="cam01", rate=30.0)
+    with pytest.raises(ObservationError, match="no keypoint format 'lab'.*install the plug-in"):
+        read_keypoints(recording.parent / "cam01.csv", format="lab", camera="cam01", rate=30.0)
 
 
 def test_a_format_of_motions_that_is_not_installed(tmp_path, recording):
@@ -304,18 +303,18 @@ def test_a_format_of_motions_that_is_not_installed(tmp_path, recording):
 
 def test_keys_that_mean_nothing_to_a_plugin(here, recording):
     text = recording.read_text()
-    recording.write_text(text.replace('format = "dlc"', 'format = "dlc"\nset = "COCO_17"'))
-    with pytest.raises(TakeError, match="'set' has no use with format = \"dlc\""):
+    recording.write_text(text.replace('format = "lab"', 'format = "lab"\nset = "COCO_17"'))
+    with pytest.raises(TakeError, match="'set' has no use with format = \"lab\""):
         read_take(recording)
     recording.write_text(text.replace('file = "cam01.csv"\n', ""))
-    with pytest.raises(TakeError, match="no file of dlc keypoints"):
+    with pytest.raises(TakeError, match="no file of lab keypoints"):
         read_take(recording)
 
 
 @pytest.mark.parametrize(
     ("group", "point", "words"),
     [
-        ("readers", "keypoints.dlc", "has the same name as kinefit-(other 0.2|formats 0.1).*pip uninstall"),
+        ("readers", "keypoints.lab", "has the same name as kinefit-(other 0.2|formats 0.1).*pip uninstall"),
         ("readers", "keypoints.openpose", "has the name of kinefit's own keypoint format 'openpose'.*pip uninstall"),
         ("exporters", "angles", "has the same name as kinefit-(other 0.2|formats 0.1).*pip uninstall"),
         ("exporters", "bvh", "has the name of kinefit's own format 'bvh'.*pip uninstall kinefit-other"),
@@ -332,8 +331,8 @@ def test_a_name_that_is_taken(other, group, point, words, tmp_path):
 
 
 def test_a_reader_of_no_kind_of_file_is_named(other):
-    other("readers", "keypoint.dlc")
-    with pytest.warns(UserWarning, match=r"kinefit-other 0\.2 .*keypoint\.dlc.* ignored.*none of keypoints\., markers"):
+    other("readers", "keypoint.lab")
+    with pytest.warns(UserWarning, match=r"kinefit-other 0\.2 .*keypoint\.lab.* ignored.*none of keypoints\., markers"):
         KEYPOINTS.names()
 
 

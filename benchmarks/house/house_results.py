@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import resource
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy.mixed.mixed_runs import MIXES
 from benchmarks.accuracy.mixed.mixed_takes import record, take_text, write
+from benchmarks.commands import ended
 from benchmarks.figures import data
 from kinefit import read_motion
 
@@ -74,18 +74,14 @@ def _initialised(source: Path, copy: Path) -> list[str]:
         if path.is_file():
             (copy / path.relative_to(source)).parent.mkdir(parents=True, exist_ok=True)
             (copy / path.relative_to(source)).symlink_to(path)
-    _command("init", str(copy))
+    ended("init", copy)
     return _words("track", str(copy / "take.toml"))
-
-
-def _command(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "kinefit", *words], capture_output=True, text=True)
 
 
 def _run(words: list[str], out: Path) -> Results:
     """Results of one command, every array of at most so many frames."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = _command(*words, "--out", str(out))
+    done = ended(*words, "--out", out)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     found = sorted(out.rglob("motion.npz"))
     if done.returncode or not found:

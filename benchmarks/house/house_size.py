@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 
 from benchmarks.figures import ROOT, figure
-from benchmarks.house.house_imports import PACKAGE, circles
+from benchmarks.house.house_imports import PACKAGE, circles, parsed
 from kinefit._doors import ROOMS, names_of
 
 _LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
@@ -26,13 +26,13 @@ _ASKED = re.compile(r"(Frame|Sensor|Measurement|Matched)$")
 _MAX_PARAMETERS = 8
 
 
-def source_size(text: str) -> Counter[str]:
+def source_size(text: str, tree: ast.Module | None = None) -> Counter[str]:
     """Size of one source in every unit of `HOUSE_SIZE`: code lines, statements, tokens, literals, constants.
 
     Blanks, comments and docstrings count nothing but as a statement each. Literals are numbers other than 0, 1, 2 and
     a half; constants are statements of a module that give a value to a name in capitals.
     """
-    tree, lines, size = ast.parse(text), set(), Counter(dict.fromkeys(HOUSE_SIZE, 0))
+    tree, lines, size = tree or ast.parse(text), set(), Counter(dict.fromkeys(HOUSE_SIZE, 0))
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type not in _LAYOUT:
             lines.update(range(token.start[0], token.end[0] + 1))
@@ -93,7 +93,8 @@ def imported_lines(tree: ast.AST) -> int:
 @cache
 def house_size() -> Counter[str]:
     """Size of the whole package."""
-    return sum((source_size(path.read_text("utf-8")) for path in sorted(PACKAGE.rglob("*.py"))), Counter())
+    sizes = (source_size(path.read_text("utf-8"), parsed(path)) for path in sorted(PACKAGE.rglob("*.py")))
+    return sum(sizes, Counter())
 
 
 @cache
@@ -106,8 +107,7 @@ def all_lines() -> int:
 
 def run() -> None:
     """Print the figures."""
-    texts = {path: path.read_text("utf-8") for path in sorted(PACKAGE.rglob("*.py"))}
-    trees = {path: ast.parse(text) for path, text in texts.items()}
+    trees = {path: parsed(path) for path in sorted(PACKAGE.rglob("*.py"))}
     size = house_size()
     figure("house_code_lines", size["code_lines"], "", "<= 60000")
     figure("house_statements", size["statements"], "", "<= 57000")
@@ -119,10 +119,10 @@ def run() -> None:
     figure("house_type_questions", sum(len(type_questions(tree)) for tree in trees.values()), "lines", "<= 5")
     outside = [tree for path, tree in trees.items() if not path.name.startswith("_kernels")]
     figure("house_many_parameters", sum(map(len, map(many_parameters, outside))), "functions outside kernels", "<= 20")
-    rooms = [path.parent for path in texts if path.name == "__init__.py" and path.parent.parent == PACKAGE]
+    rooms = [path.parent for path in trees if path.name == "__init__.py" and path.parent.parent == PACKAGE]
     figure("house_rooms", len(rooms), "", "<= 16")
     figure("house_door", len(set(names_of("kinefit")) - set(ROOMS)), "names beside the rooms", "<= 45")
-    sizes = {path.parent: len(entries(path.parent)) for path in texts if path.parent != PACKAGE}
+    sizes = {path.parent: len(entries(path.parent)) for path in trees if path.parent != PACKAGE}
     room = max(sizes, key=lambda room: sizes[room])
     figure("house_largest_room", sizes[room], f"entries in {room.relative_to(PACKAGE).as_posix()}", "<= 15")
     imports = sum(imported_lines(tree) for tree in trees.values())

@@ -28,6 +28,7 @@ from tests.oracle import design
 from benchmarks.accuracy.surfaces.retarget import validated
 from benchmarks.accuracy.surfaces.surface_body import OFF, moving_arm
 from benchmarks.figures import amount, figure, quick
+from benchmarks.timing import timed
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import Metaballs
 from kinefit.bodies.surfaces.metaballs import LEVEL
@@ -282,9 +283,8 @@ def _time() -> None:
     of = nearest(body, state, x, max_distance=0.05).segment
     spent, radii = [], []
     for _ in range(7):
-        began = time.process_time()
-        normal_equations(body, state, surface_rows(body, state, x, max_distance=0.05, sigma=NOISE, segment=of))
-        spent.append(time.process_time() - began)
+        with timed(spent):
+            normal_equations(body, state, surface_rows(body, state, x, max_distance=0.05, sigma=NOISE, segment=of))
         began, n = time.process_time(), 0
         for limb in body.surfaces:
             f = body.tree.forward(state.T_world_root, state.angles)[0][limb.segment]

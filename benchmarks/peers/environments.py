@@ -10,7 +10,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,8 @@ from kinefit._jit import cache_directory
 _BASE = ("numpy==2.4.6", "scipy==1.17.1")
 _ROOT = Path(__file__).parents[2]
 _OWN_PATHS = "PYTHONPATH", "PYTHONHOME", "PYTHONSAFEPATH"  # of this process, not of the peer
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_LIMIT_S = 900.0  # [s] for the runner of a peer
+_ONE_THREAD = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def environment(peer: str) -> tuple[Path | None, str]:
     return python, ""
 
 
-def run_peer(peer: str, folder: Path, timeout: float = 900.0) -> dict[str, Any]:
+def run_peer(peer: str, folder: Path) -> dict[str, Any]:
     """Run a peer's runner on an exchange folder, on one core and one thread.
 
     Returns
@@ -105,23 +106,41 @@ def run_peer(peer: str, folder: Path, timeout: float = 900.0) -> dict[str, Any]:
     record = PEERS[peer]
     variables = {name: value for name, value in os.environ.items() if name not in _OWN_PATHS}
     command = [str(python), "-m", f"benchmarks.peers.{record.runner}", str(folder.resolve()), *record.arguments]
+    found, reason, _ = measured(on_one_core(command), variables, _LIMIT_S)
+    return found or {"peer": peer, "reason": reason}
+
+
+def on_one_core(command: list[str]) -> list[str]:
+    """The command held to one core, where the system can do that."""
     taskset = shutil.which("taskset")
     if taskset and hasattr(os, "sched_getaffinity"):
-        command = [taskset, "-c", str(max(os.sched_getaffinity(0))), *command]
+        return [taskset, "-c", str(max(os.sched_getaffinity(0))), *command]
+    return command
+
+
+def measured(
+    command: list[str], variables: Mapping[str, str], timeout: float
+) -> tuple[dict[str, Any], str, list[str]]:
+    """Run a process on one thread from the checkout; it prints what it measured as JSON in its last line.
+
+    Returns
+    -------
+    what it measured, {} where it printed nothing; why it failed, also where it did so afterwards; its other lines
+    """
     try:
         done = subprocess.run(
-            command,
-            cwd=_ROOT,
-            env=variables | dict.fromkeys(_ONE_THREAD, "1"),
-            timeout=timeout,
-            capture_output=True,
-            text=True,
-        )
-        return json.loads(done.stdout.splitlines()[-1])
-    except subprocess.TimeoutExpired:
-        return {"peer": peer, "reason": f"did not finish in {timeout:g} s"}
+            command, cwd=_ROOT, env={**variables, **dict.fromkeys(_ONE_THREAD, "1")}, timeout=timeout,
+            capture_output=True, text=True,
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired) as error:
+        late = isinstance(error, subprocess.TimeoutExpired)
+        return {}, f"did not finish in {timeout:g} s" if late else str(error), []
+    lines = done.stdout.strip().splitlines()
+    failed = f"failed: {_last_line(done.stderr) or f'exit code {done.returncode}'}"
+    try:
+        return json.loads(lines[-1]), failed if done.returncode else "", lines[:-1]
     except (IndexError, ValueError):
-        return {"peer": peer, "reason": f"failed: {_last_line(done.stderr) or f'exit code {done.returncode}'}"}
+        return {}, failed, lines
 
 
 def _interpreters(versions: tuple[str, ...]) -> Iterator[str]:

@@ -19,10 +19,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.mixed.mixed_takes import DETECTOR, camera_error
+from benchmarks.accuracy.mixed.mixed_takes import DETECTOR
 from benchmarks.figures import amount, figure
 from benchmarks.robustness.faulty_recordings import Inputs
 from benchmarks.scenes.motions import library
+from benchmarks.scenes.simulated import calibrated, rows_of, turned
 from kinefit import Motion
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
@@ -82,11 +83,6 @@ def _kick(camera: Camera, random: np.random.Generator) -> Camera:
     return camera.with_pose(se3.transform(se3.exp_so3(turn), shift) @ camera.T_camera_world)
 
 
-def _turned(rig: Rig, name: str, axis: int, degrees: float) -> Rig:
-    T = se3.transform(se3.exp_so3(np.radians(degrees) * np.eye(3)[axis]), np.zeros(3))
-    return Rig(tuple(c.with_pose(T @ c.T_camera_world) if c.name == name else c for c in rig))
-
-
 def scene(name: str, seed: int, seconds: float = 8.0) -> Scene:
     """A motion in front of four cameras."""
     random = np.random.default_rng([48, seed])
@@ -95,7 +91,7 @@ def scene(name: str, seed: int, seconds: float = 8.0) -> Scene:
     else:
         truth = resampled(library([name])[name], RATE * FINE)
     rig = studio_rig(truth)
-    told = Rig(tuple(c.with_pose(camera_error(random) @ c.T_camera_world) for c in rig))
+    told = calibrated(rig, random)
     moved = Rig(tuple(_kick(c, random) for c in rig))
     frames = min(len(truth), round(seconds * RATE * FINE)) // FINE - 12
     return Scene(name, frames, truth.up, told, _seen(truth, rig, seed), _seen(truth, moved, seed))
@@ -103,8 +99,7 @@ def scene(name: str, seed: int, seconds: float = 8.0) -> Scene:
 
 def _seen(truth: Motion, rig: Rig, seed: int) -> NDArray:
     found = simulate_keypoints(truth, rig, DETECTOR, drift_px=2.0, seed=seed)
-    arrays = [np.concatenate([k.points[:, 0], k.confidence[:, 0, :, None]], axis=-1) for k in found]
-    return np.nan_to_num(np.array(arrays)).astype(np.float32)
+    return np.array([rows_of(k) for k in found]).astype(np.float32)
 
 
 def faults(s: Scene, seed: int) -> Iterator[Fault]:
@@ -114,7 +109,7 @@ def faults(s: Scene, seed: int) -> Iterator[Fault]:
     name, half, frames = s.told.names[c], s.frames // 2, s.frames
     own, both = frozenset({name}), frozenset({name, s.told.names[other]})
     for k, axis in enumerate("xyz"):
-        yield Fault(f"turned about {axis}", s.inputs(told=_turned(s.told, name, k, 3.0)), own,
+        yield Fault(f"turned about {axis}", s.inputs(told=turned(s.told, name, np.radians(3.0) * np.eye(3)[k])), own,
                     r"rotated|disagrees with")  # fmt: skip
     points = np.stack([p[r] for p, r in zip(s.seen, s.rows())])
     kicked, at = points.copy(), half + 10

@@ -10,20 +10,17 @@ import re
 import tempfile
 from pathlib import Path
 
-from click.testing import CliRunner
-
+from benchmarks.commands import QUIET, invoked
 from benchmarks.figures import amount, figure, quick
 from benchmarks.robustness.faulty_inputs import Fault, faults
 from benchmarks.robustness.faulty_recordings import Inputs, recordings, right_takes
-from kinefit.cli import main
 
-QUICK = ("translations times 1.8", "left and right exchanged", "the x of a translation negated")
+FEW = ("translations times 1.8", "left and right exchanged", "the x of a translation negated")
 
 
 def told(take: Path) -> list[str] | None:
     """The faults on top of what `kinefit track` says of a take, or of why it cannot track it; None where it cannot."""
-    options = ["--no-overlays", "--no-report", "--formats", "motion", "--realtime", "--restart"]
-    result = CliRunner().invoke(main, ["track", str(take), "--out", str(take.parent / "out"), *options])
+    result = invoked("track", take, "--out", take.parent / "out", *QUIET)
     if result.exit_code == 0:
         top = result.stdout.partition("\nsensor ")[0].partition("\nnote: ")[0]
         return [block.strip() for block in re.split(r"\n(?=fault: )", top) if block.strip().startswith("fault: ")]
@@ -52,7 +49,7 @@ def run() -> None:
             usual = told(inputs.write(Path(where) / inputs.name / "right")) or []
             clean, alarms = clean + 1, alarms + bool([b for b in usual if not inputs.is_off or "bias" not in b])
             for name, fault in faults(inputs):
-                if quick() and (name not in QUICK or inputs.name != "balancing"):
+                if quick() and (name not in FEW or inputs.name != "balancing"):
                     continue
                 slug = name.replace(" ", "_")
                 found = told(fault.make(inputs).write(Path(where) / inputs.name / slug)) or []
@@ -66,5 +63,5 @@ def run() -> None:
             said = "cannot be tracked" if faults_told is None else " ".join(faults_told) or "nothing"
             print(f"# {name}, right files: {said}", flush=True)
     named = sum(not recordings_missed for recordings_missed in missed.values())
-    figure("faults_inputs_named", float(named), f"of {len(missed)}", f"== {amount(15, len(QUICK))}")
+    figure("faults_inputs_named", float(named), f"of {len(missed)}", f"== {amount(15, len(FEW))}")
     figure("faults_inputs_false_alarms", float(alarms), f"of {clean} recordings with right files", "== 0")

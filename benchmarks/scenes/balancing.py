@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-
-from kinefit.bodies.motion import Motion
-from kinefit.readers.take.file import read_take
-from kinefit.readers.take.load import Observations, load_observations
-from kinefit.takes.track import track_take
 
 TRIAL = "video_balancing_4cam"
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
@@ -31,39 +25,24 @@ def trial_text(
 
     Parameters
     ----------
+    detector : "openpose", "mediapipe", or "" for no keypoints.
     cameras : names, or {name: tables of other sensors of that camera}.
     head : further lines of `[take]`.
     keypoints : further lines of each `[[keypoints]]`.
     """
     beside = cameras if isinstance(cameras, Mapping) else dict.fromkeys(cameras, "")
-    file, format_lines = _KEYPOINTS[detector]
+    file, format_lines = _KEYPOINTS.get(detector, ("", ""))
     text = f'[take]\nup = "z"\n{head}[calibration]\nfile = "{folder}/Calib_refined_static.toml"\nunit = "m"\n'
     for camera, sensors in beside.items():
         boxed = 'image = "letterboxed"\n' if camera in ("cam01", "cam02") else ""
         text += f'[[camera]]\nname = "{camera}"\nvideo = "{folder}/videos/{camera}.mp4"\n{boxed}'
-        text += f'[[keypoints]]\ncamera = "{camera}"\nfile = "{folder}/{file.format(camera)}"\n'
-        text += f"{format_lines}{keypoints}{sensors}"
+        if file:
+            text += f'[[keypoints]]\ncamera = "{camera}"\nfile = "{folder}/{file.format(camera)}"\n'
+            text += f"{format_lines}{keypoints}"
+        text += sensors
     return text
 
 
 def masks_of(folder: Path, camera: str) -> str:
     """The table of the masks that the recording has."""
     return f'[[silhouette]]\ncamera = "{camera}"\nfile = "{folder}/person_masks/{camera}"\nframe = "video"\n'
-
-
-def seen_of(text: str) -> Observations:
-    """What the sensors of a take saw; videos are read when they are asked."""
-    with tempfile.TemporaryDirectory() as work:
-        path = Path(work) / "take.toml"
-        path.write_text(text, encoding="utf-8")
-        seen = load_observations(read_take(path))
-    assert seen.rig is not None
-    return seen
-
-
-def tracked(text: str, **options: object) -> tuple[Motion, Observations]:
-    """The motion of a take, and what its sensors saw; options of `kinefit.track_take`."""
-    with tempfile.TemporaryDirectory() as work:
-        path = Path(work) / "take.toml"
-        path.write_text(text, encoding="utf-8")
-        return track_take(path, **options)  # type: ignore[arg-type]

@@ -15,6 +15,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import exp_so3, log_so3, transform
 from kinefit.rigs.bar.targets import BarViews
+from kinefit.simulation.figures import look_at
 
 
 @checked
@@ -30,11 +31,8 @@ def bar_rig(count: int = 3, size: tuple[int, int] = (1920, 1080), *, seed: int |
         azimuth = np.radians(20.0 + max(70.0, 300.0 / count) * i + 10.0 * d[0])
         distance = 3.8 + 0.4 * d[1]
         centre = np.array([distance * np.cos(azimuth), distance * np.sin(azimuth), 1.2 + 0.4 * (i % 4) + 0.3 * d[2]])
-        forward = np.array([0.1 * d[3], 0.1 * d[4], 1.0]) - centre
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        R = exp_so3(np.array([0.0, 0.0, 0.1 * d[5]])) @ np.stack([right, np.cross(forward, right), forward])
+        level = look_at(centre, np.array([0.1 * d[3], 0.1 * d[4], 1.0]), np.array([0.0, 0.0, 1.0]))
+        R = exp_so3(np.array([0.0, 0.0, 0.1 * d[5]])) @ level[:3, :3]
         f = (0.6 + 0.1 * (i % 3) + 0.08 * d[6]) * size[0]
         u, v = size[0] / 2 - 9.0 * (i % 3) + 10.0 * d[7], size[1] / 2 + 6.0 * (i % 3) + 10.0 * d[8]
         K = np.array([[f, 0.0, u], [0.0, (1.001 + 1e-3 * d[9]) * f, v], [0.0, 0.0, 1.0]])
@@ -123,13 +121,13 @@ CORNERS_LENGTH = 0.162
 
 
 def write_corners(
-    recording: Path, table: Path, *, pairs: Sequence[tuple[int, int]] = CORNERS, late: int = 0, seed: int = 0
+    recording: Path, table: Path, *, pairs: Sequence[tuple[int, int]] = CORNERS, late: int = 0
 ) -> None:
     """Write pairs of corners of a moved board, as four webcams saw them, as centroids of a bar in random order.
 
     The fourth webcam's images get the number of those `late` times before.
     """
-    rng, seen = np.random.default_rng(seed), dict[tuple[int, int, int], str]()
+    rng, seen = np.random.default_rng(0), dict[tuple[int, int, int], str]()
     with (recording / "calibration/extrinsic/xy.csv").open() as file:
         for row in csv.DictReader(file):
             at = int(row["sync_index"]), int(row["port"]), int(row["point_id"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import data
 from kinefit.bodies.marker_sets import find_marker_set
+from kinefit.markers.take.takes import one_after_the_other
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
 
@@ -162,14 +163,7 @@ def training(case: Case) -> Markers | None:
     takes = [load(part) for part in case.train]
     if any(t is None for t in takes):
         return None
-    found = [t for t in takes if t is not None]
-    names = tuple(dict.fromkeys(n for t in found for n in t.names))
-    positions = np.full((sum(map(len, found)), len(names), 3), np.nan)
-    at = 0
-    for t in found:
-        positions[at : at + len(t), [names.index(n) for n in t.names]] = t.positions
-        at += len(t)
-    return replace(found[0], names=names, positions=positions)
+    return one_after_the_other([t for t in takes if t is not None])
 
 
 def truth_of(take: Markers, labels: tuple[str, ...]) -> NDArray:
@@ -201,6 +195,12 @@ def shuffled(
     order = rng.permutation(len(at))
     where = {take.names[c]: i for i, c in enumerate(column[order]) if c >= 0}
     return at[order], np.array([where.get(n, -1) for n in labels])
+
+
+def counts(found: NDArray, truth: NDArray) -> NDArray:
+    """(3,) how many labels of a frame are right, have a point that is not theirs, and are seen; both (M,)."""
+    right = found == truth
+    return np.array([(right & (truth >= 0)).sum(), (~right & (found >= 0)).sum(), (truth >= 0).sum()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,14 +267,29 @@ def broken(
     return Broken(replace(take, names=names, positions=positions, residual=None), truth)
 
 
-def _meetings(P: NDArray, rate: float, near: float = 0.06) -> Iterator[tuple[int, int, int]]:
+def shares(column: NDArray, cut: Broken, take: Markers, labels: Sequence[str]) -> tuple[float, float]:
+    """Shares of the labels seen in a broken take that have the right name, and a wrong one.
+
+    column : (F, M) the column that each label was given, -1 for none.
+    """
+    own = np.array([take.names.index(n) if n in take.names else -9 for n in labels])
+    named = np.where(column >= 0, cut.truth[np.arange(len(take))[:, None], column], -2)
+    seen = (cut.truth[:, :, None] == own).any(1)
+    wrong = (column >= 0) & (named != own)
+    return float(((named == own) & seen).sum() / seen.sum()), float(wrong.sum() / seen.sum())
+
+
+_NEAR = 0.06  # [m] at which two markers meet
+
+
+def _meetings(P: NDArray, rate: float) -> Iterator[tuple[int, int, int]]:
     """Frames in which two markers are nearest to each other, and nearer than 6 cm, having been farther apart."""
     for a in range(P.shape[1]):
         for b in range(a):
             d = np.linalg.norm(P[:, a] - P[:, b], axis=-1)
-            if not (np.nanmin(d, initial=np.inf) < near < np.nanmax(d, initial=0.0) / 1.5):
+            if not (np.nanmin(d, initial=np.inf) < _NEAR < np.nanmax(d, initial=0.0) / 1.5):
                 continue
-            close = np.nan_to_num(d, nan=np.inf) < near
+            close = np.nan_to_num(d, nan=np.inf) < _NEAR
             for rows in np.split(np.arange(len(d)), np.flatnonzero(np.diff(close.astype(int))) + 1):
                 if close[rows[0]]:
                     yield int(rows[np.argmin(d[rows])]), a, b

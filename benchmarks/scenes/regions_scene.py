@@ -202,6 +202,13 @@ def plates() -> tuple[NDArray, ...]:
     return tuple(sized)
 
 
+def face_normals(x: NDArray, faces: NDArray) -> NDArray:
+    """(T, 3) unit normals of triangles (T, 3) with corners (V, 3), outwards."""
+    corners = x[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12))
+
+
 def drawn(what: Thing, T: NDArray, light: NDArray, canvas: Canvas, cam: Camera) -> tuple[NDArray, NDArray]:
     """Colours (h, w, 3) and cover (h, w) of an object in a canvas of twice the camera's size."""
     lens = 2 * lens_of(cam) + (0.0, 0.0, 0.5, 0.5)
@@ -212,10 +219,7 @@ def drawn(what: Thing, T: NDArray, light: NDArray, canvas: Canvas, cam: Camera) 
     z, face = raster.depth[v, u], raster.face[v, u]
     seen = np.stack([(u - lens[2]) / lens[0] * z, (v - lens[3]) / lens[1] * z, z], axis=1)
     own = (seen - T[:3, 3]) @ T[:3, :3]
-    corners = x[what.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
-    share = 0.45 + 0.55 * np.maximum(normal @ light, 0.0)
+    share = 0.45 + 0.55 * np.maximum(face_normals(x, what.faces) @ light, 0.0)
     grain = np.sin(own @ (190.0, 310.0, 130.0)) * np.sin(own @ (-270.0, 90.0, 240.0)) + np.sin(own @ (60, -80, 110.0))
     colour[v, u] = what.colours[face] * (share[face] * (1.0 + what.grain * grain))[:, None]
     return colour, cover

@@ -18,6 +18,7 @@ from kinefit.observations import SilhouetteFrame
 from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.simulation.figures import look_at
 
 
 def ring(count: int, *, size: tuple[int, int] = (640, 480), focal: float = 525.0, away: float = 3.0) -> Rig:
@@ -32,14 +33,8 @@ def ring(count: int, *, size: tuple[int, int] = (640, 480), focal: float = 525.0
 
 def looking(name: str, eye: NDArray, at: NDArray, size: tuple[int, int], focal: float) -> Camera:
     """A camera at a place that looks at another, y up."""
-    z = (at - eye) / np.linalg.norm(at - eye)
-    x = np.cross(z, [0.0, 1.0, 0.0])
-    x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z])
-    T[:3, 3] = -T[:3, :3] @ eye
     K = [[focal, 0, size[0] / 2 - 0.5], [0, focal, size[1] / 2 - 0.5], [0, 0, 1]]
-    return Camera(name, size, K, T_camera_world=T)
+    return Camera(name, size, K, T_camera_world=look_at(eye, at, np.array([0.0, 1.0, 0.0])))
 
 
 def shape_from_silhouettes(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -52,6 +54,16 @@ def textured_picture(
     image = cv2.resize(fine, camera.size, interpolation=cv2.INTER_AREA)
     random = np.random.default_rng([seed, frame, *camera.name.encode()])
     return np.clip(np.rint(image + noise * random.standard_normal(image.shape)), 0, 255).astype(np.uint8)
+
+
+def write_video(path: Path, images: Iterable[NDArray], rate: float, codec: str = "MJPG") -> None:
+    """Write grey images (H, W), or BGR images (H, W, 3), as a video; "FFV1" is without loss."""
+    video = None
+    for image in images:
+        video = video or cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), rate, image.shape[1::-1])
+        video.write(image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    if video is not None:
+        video.release()
 
 
 @cache

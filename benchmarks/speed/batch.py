@@ -10,14 +10,13 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.commands import begun, used
 from benchmarks.figures import NotMeasured, amount, figure
 from benchmarks.speed.long import write_long_take
 from kinefit.takes.batch.one import Choices, TakeJob
@@ -50,7 +49,7 @@ def speed(folder: Path) -> None:
     seconds = {}
     for workers in (1, 2):
         began = time.monotonic()
-        _batch(folder, f"out-{workers}", workers)
+        used(*_words(folder, f"out-{workers}", workers))
         seconds[workers] = time.monotonic() - began
     ratio, reason = seconds[1] / seconds[2], ""
     print(f"  {seconds[1]:.1f} s with one worker, {seconds[2]:.1f} s with two: {ratio:.2f} times; load {load:.1f}")
@@ -62,7 +61,7 @@ def speed(folder: Path) -> None:
 def resumed(folder: Path) -> float:
     """1 where one worker, two, and a run that was killed and gone on with leave the same files, bit for bit."""
     one, two = (contents(folder / f"out-{workers}") for workers in (1, 2))
-    process = subprocess.Popen(_command(folder, "killed", 2), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = begun(*_words(folder, "killed", 2))
     while process.poll() is None and not list((folder / "killed").rglob(RECORD)):
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
@@ -70,7 +69,7 @@ def resumed(folder: Path) -> float:
     done = {path: path.stat().st_mtime_ns for path in (folder / "killed").rglob(RECORD)}
     unfinished = len(list((folder / "killed").rglob("unfinished")))
     time.sleep(1.0)  # its workers end
-    _batch(folder, "killed", 2)
+    used(*_words(folder, "killed", 2))
     kept = all(path.stat().st_mtime_ns == time_ns for path, time_ns in done.items())
     takes = len(list((folder / "sessions").iterdir()))
     print(f"  killed after {len(done)} of {takes} takes, {unfinished} unfinished; those done were kept: {kept}")
@@ -114,13 +113,8 @@ def nothing(job: TakeJob) -> tuple[Row, ...]:
     return (Row(take=job.label, folder=job.folder, frames=1, seconds=0.1, quality=1.0, lost=0.0),)
 
 
-def _command(folder: Path, out: str, workers: int) -> list[str]:
-    words = ["batch", f"{folder}/sessions/**/take.toml", "--out", str(folder / out), "--workers", str(workers)]
-    return [sys.executable, "-m", "kinefit", *words, *_OPTIONS]
-
-
-def _batch(folder: Path, out: str, workers: int) -> None:
-    subprocess.run(_command(folder, out, workers), check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+def _words(folder: Path, out: str, workers: int) -> list[object]:
+    return ["batch", f"{folder}/sessions/**/take.toml", "--out", folder / out, "--workers", workers, *_OPTIONS]
 
 
 def _load() -> float:

@@ -11,20 +11,19 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from time import process_time
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import FAILED, LEFT_OUT, ROOT, amount, figure, peers, quick
+from benchmarks.figures import FAILED, LEFT_OUT, amount, figure, peers, quick
+from benchmarks.peers.environments import measured, on_one_core
+from benchmarks.timing import timed
 
 MOVEMENTS = amount(("walk", "clap", "sit_down", "kick"), ("clap",))  # all of the body, its arms, all its bends, one leg
 POINTS, COUNTS = 5000, (1000, 2000, 5000, 10000, 20000, 50000)
@@ -71,22 +70,9 @@ def run() -> None:
 
 def _process(command: list[str]) -> tuple[dict[str, Any], str]:
     """What a process measured on one core, and why it did not; its other lines are printed."""
-    names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    taskset = shutil.which("taskset")
-    if taskset and hasattr(os, "sched_getaffinity"):
-        command = [taskset, "-c", str(max(os.sched_getaffinity(0))), *command]
-    try:
-        done = subprocess.run(
-            command, cwd=ROOT, env=os.environ | dict.fromkeys(names, "1"), capture_output=True,
-            text=True, timeout=1800,
-        )  # fmt: skip
-    except (OSError, subprocess.TimeoutExpired) as error:
-        return {}, str(error)
-    lines = done.stdout.strip().splitlines()
-    print(*lines[: len(lines) - (done.returncode == 0)], sep="\n", flush=True)
-    if done.returncode:
-        return {}, (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-    return json.loads(lines[-1]), ""
+    found, reason, lines = measured(on_one_core(command), os.environ, 1800.0)
+    print(*lines, sep="\n", flush=True)
+    return {} if reason else found, reason
 
 
 class Stage:
@@ -138,9 +124,8 @@ class Stage:
         tracker.start_at(self.motion.state(0))
         ms, results = [], []
         for frame in frames:
-            began = process_time()
-            results.append(tracker.update([frame]))
-            ms.append(1e3 * (process_time() - began))
+            with timed(ms, 1e3):
+                results.append(tracker.update([frame]))
         return np.array(ms), results
 
     def error(self, results: list[Any]) -> NDArray:

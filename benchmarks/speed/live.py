@@ -17,6 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.figures import amount, data, figure, recording
+from benchmarks.scenes.balancing import TRIAL, trial_text
+from benchmarks.scenes.simulated import to_and_fro
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation.recordings import warm_keypoints
@@ -26,7 +28,7 @@ from kinefit.studio.live.record import MotionRecord
 from kinefit.studio.live.session import LiveSession
 from kinefit.studio.live.take import live_session
 
-TRIAL, RATE = "video_balancing_4cam", 30.0
+RATE = 30.0
 _CLIENT = (
     "import sys\nfrom websockets.sync.client import connect\n"
     "with connect(sys.argv[1]) as s:\n    for _ in s: pass\n"
@@ -56,10 +58,8 @@ class Loop:
         self.thread.join()
 
     def run(self, inbox):
-        count, begin = len(self.keypoints[0]), time.monotonic()
-        for k in range(self.frames):
-            step = k % (2 * count - 2)
-            step = step if step < count else 2 * count - 2 - step
+        begin = time.monotonic()
+        for k, step in enumerate(to_and_fro(len(self.keypoints[0]), self.frames).tolist()):
             if self.over.wait(max(begin + k / self.rate - time.monotonic(), 0.0) if self.rate else 0.0):
                 break
             seen = [r.rows(slice(step, step + 1), k / RATE) for r in self.keypoints]
@@ -88,17 +88,10 @@ class Watch:
 
 def write_take(folder, *, keypoints):
     """The trial as a take, with or without a detector's keypoints; its path."""
-    trial = data(TRIAL)
-    lines = ["[take]", 'name = "balancing"', "rate = 60.0", 'up = "z"']
-    lines += ["[calibration]", f'file = "{trial}/Calib_refined_static.toml"']
-    for name in ("cam01", "cam02", "cam03", "cam04"):
-        lines += ["[[camera]]", f'name = "{name}"', f'video = "{trial}/videos/{name}.mp4"']
-        lines += ['image = "letterboxed"'] if name in ("cam01", "cam02") else []
-        if keypoints:
-            lines += ["[[keypoints]]", f'camera = "{name}"', f'file = "{trial}/mediapipe_landmarks_{name}.npy"']
-            lines += ['format = "mediapipe"', 'frame = "video"', "sigma = 10.0"]
+    head = 'name = "balancing"\nrate = 60.0\n'
+    text = trial_text(data(TRIAL), detector="mediapipe" if keypoints else "", head=head, keypoints="sigma = 10.0\n")
     path = Path(folder) / "take.toml"
-    path.write_text("\n".join(lines))
+    path.write_text(text)
     return path
 
 

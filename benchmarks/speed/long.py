@@ -7,10 +7,7 @@ with all usual formats and the report. The page is of a motion that was tracked,
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import replace
@@ -18,7 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.commands import begun, used
 from benchmarks.figures import LEFT_OUT, amount, figure, quick
+from benchmarks.scenes.simulated import to_and_fro
 from kinefit.bodies import load_body
 from kinefit.bodies.motion import Motion
 from kinefit.exporters.report.report import write_report
@@ -41,7 +40,7 @@ def write_long_take(folder: Path, frames: int, *, seed: int = 0) -> Path:
     rig = studio_rig(motion, cameras=2)
     folder.mkdir(parents=True, exist_ok=True)
     write_calibration(rig, folder / "calibration.toml")
-    order = np.resize(np.concatenate([np.arange(len(motion)), np.arange(len(motion) - 2, 0, -1)]), frames)
+    order = to_and_fro(len(motion), frames)
     names = KEYPOINT_SETS["MEDIAPIPE_33"]
     out = {c.name: np.zeros((frames, len(names), 3), np.float32) for c in rig}
     for start in range(0, frames, _PIECE):
@@ -78,7 +77,7 @@ def run() -> None:
                 continue
             take = write_long_take(folder / str(frames), amount(frames, 60))
             out = folder / f"{frames}-out"
-            seconds, memory = tracked(take, out)
+            seconds, memory = used("track", take, "--out", out)
             figure(f"long_memory_{frames}", memory, "MB", goal)
             print(f"  {seconds:.0f} s, {sum(p.stat().st_size for p in out.rglob('*')) / 1e6:.0f} MB of results")
         figure("long_resume_equal", _resumed(folder, amount(3_000, 320)), "of 1", "== 1")
@@ -90,26 +89,11 @@ def run() -> None:
         print(f"  of {len(hour)} frames, in {time.process_time() - began:.1f} s")
 
 
-def command(take: Path, out: Path, *options: str) -> list[str]:
-    """The words of `kinefit track`, for a process of its own."""
-    return [sys.executable, "-m", "kinefit", "track", str(take), "--out", str(out), *options]
-
-
-def tracked(take: Path, out: Path, *options: str) -> tuple[float, float]:
-    """Track a take in a process of its own: [s] of the processor and [MB] at most."""
-    process = subprocess.Popen(command(take, out, *options), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    _, status, used = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise RuntimeError(f"kinefit track {take} ended with code {process.returncode}")
-    return used.ru_utime + used.ru_stime, used.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
-
-
 def _resumed(folder: Path, frames: int) -> float:
     """1 where a run that was killed halfway, and went on, gives the files of one that was not, all bits alike."""
     take, whole, killed = write_long_take(folder / "resume", frames), folder / "whole", folder / "killed"
-    tracked(take, whole)
-    process = subprocess.Popen(command(take, killed), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    used("track", take, "--out", whole)
+    process = begun("track", take, "--out", killed)
     rows = killed / "unfinished" / "so-far.csv"
     while process.poll() is None and not (rows.exists() and rows.read_bytes().count(b"\n") > frames / 2):
         time.sleep(0.02)
@@ -117,7 +101,7 @@ def _resumed(folder: Path, frames: int) -> float:
     process.wait()
     left = rows.read_bytes().count(b"\n") - 1 if rows.exists() else 0
     print(f"  killed after {left} of {frames} frames; left: {sorted(p.name for p in rows.parent.iterdir())}")
-    tracked(take, killed)
+    used("track", take, "--out", killed)
     return float(same_results(whole, killed) and 0 < left < frames and not rows.parent.exists())
 
 

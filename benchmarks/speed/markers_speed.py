@@ -15,7 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.figures import NotMeasured, amount, each, figure
-from benchmarks.scenes.marker_takes import broken, load, shuffled
+from benchmarks.scenes.marker_takes import broken, counts, load, shuffled
+from benchmarks.timing import timed
 from kinefit import Markers, fit_marker_subject, fit_markers, identify, identify_take, learn_model, load_body
 from kinefit.markers.model.model import MarkerModel
 
@@ -39,15 +40,14 @@ def large_set() -> None:
             continue
         model, rng = learn_model(taught), np.random.default_rng(0)
         identify(model, shuffled(asked, model.labels, 0, rng)[0])  # compiled
-        times, right, seen = [], 0, 0
+        times, counted = [], np.zeros(3, int)
         for f in np.unique(np.linspace(0, len(asked) - 1, FRAMES).astype(int)):
             points, truth = shuffled(asked, model.labels, int(f), rng, ghosts=ghosts)
-            start = time.process_time()
-            found = identify(model, points).assignment
-            times.append(1e3 * (time.process_time() - start))
-            right += int(((found == truth) & (truth >= 0)).sum())
-            seen += int((truth >= 0).sum())
-        print(f"# {len(model)} markers: median {np.median(times):.0f} ms, {100 * right / seen:.1f} % of labels right")
+            with timed(times, 1e3):
+                found = identify(model, points).assignment
+            counted += counts(found, truth)
+        share = 100 * counted[0] / counted[2]
+        print(f"# {len(model)} markers: median {np.median(times):.0f} ms, {share:.1f} % of labels right")
         figure(name, max(times), "ms a frame, slowest", "<= 200")
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from benchmarks.accuracy.mixed.mixed_takes import CAMERAS, RATE, record, take_text, write
 from benchmarks.figures import figure
+from benchmarks.scenes.simulated import to_and_fro
 from kinefit import Recording, load_body, load_observations, read_take, track
 from kinefit.bodies import Body
 from kinefit.fitting.smoothing import spool
@@ -62,9 +63,7 @@ def peak(recording: Recording, body: Body) -> int:
 
 def played(recording: Recording, frames: int) -> Recording:
     """A recording to and fro until it has so many frames."""
-    count = len(recording)
-    order = np.resize(np.concatenate([np.arange(count), np.arange(count - 2, 0, -1)]), frames)
-    times = np.arange(frames) / RATE
+    order, times = to_and_fro(len(recording), frames), np.arange(frames) / RATE
     steps = lambda i: [replace(f, time=float(times[i])) for f in recording.steps(int(order[i]))]
     keypoints = [replace(k, points=k.points[order], confidence=k.confidence[order]) for k in recording.keypoints]
     return replace(recording, times=times, steps=steps, keypoints=tuple(keypoints))

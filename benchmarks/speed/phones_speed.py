@@ -8,15 +8,16 @@ moves no more than in the recording.
 from __future__ import annotations
 
 import resource
-import subprocess
-import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import av
 
+from benchmarks.commands import ended
 from benchmarks.figures import figure, whole_recording
+from benchmarks.timing import took
 from kinefit.readers.videos.video import Video
 
 _SECONDS, _RATE = 10.0, 60
@@ -32,10 +33,7 @@ def run() -> None:
             _played(path, folder / path.name)
         spent = {}
         for step in (["init", "."], ["detect", "take.toml"], ["track", "take.toml"]):
-            since = time.perf_counter()
-            command = [sys.executable, "-m", "kinefit", *step]
-            subprocess.run(command, cwd=folder, check=True, capture_output=True)
-            spent[step[0]] = time.perf_counter() - since
+            _, spent[step[0]] = took(partial(ended, *step, cwd=folder, check=True), clock=time.perf_counter)
         whole = 4.0 * _SECONDS
         print("# " + ", ".join(f"{name} {seconds:.0f} s" for name, seconds in spent.items()))
         figure("phones_speed", sum(spent.values()) / whole, "x the length of all videos", "<= 6")

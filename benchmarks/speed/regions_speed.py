@@ -5,7 +5,6 @@ A rendered person (the catalogue's humanoid, painted in parts) sways before a wa
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,10 +12,10 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
 from benchmarks.scenes.silhouettes_scene import ring, swaying
+from benchmarks.speed.rounds import tracked_rounds
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.rendering import render_body
 from kinefit.bodies.surfaces.places import body_mesh
-from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry.camera import Rig
 from kinefit.observations import ColourFrame
 
@@ -48,20 +47,9 @@ def run() -> None:
     seen = pictures(body, rig, truth)
     print(f"# {len(body_mesh(body).faces)} triangles, 640 x 480, image processing included; processor time")
     for count, goal in ((1, "<= 10"), (7, "<= 70")):
-        spent, off = [], []
-        for _ in range(ROUNDS):
-            tracker, times = Tracker(body, rig, rate=RATE, up="y"), []
-            tracker.start_at(truth[0])
-            for i, images in enumerate(seen):
-                frames = [ColourFrame(name, i / RATE, images[name]) for name in rig.names[:count]]
-                began = time.process_time()
-                result = tracker.update(frames)
-                times.append(1e3 * (time.process_time() - began))
-                assert result is not None
-                off.append(np.degrees(np.abs(result.state.angles - truth[i].angles)).mean())
-            spent.append(times)
-        best = np.min(spent, axis=0)[WARM:]
+        frames = [[ColourFrame(n, i / RATE, one[n]) for n in rig.names[:count]] for i, one in enumerate(seen)]
+        told = tracked_rounds(body, rig, truth, frames, rate=RATE, rounds=ROUNDS, warm=WARM)
         cameras = "1 camera" if count == 1 else f"{count} cameras"
         unit = f"ms, median of each frame's best of {ROUNDS}"
-        figure(f"whole person, {cameras}: CPU time a frame", float(np.median(best)), unit, goal)
-        print(f"  {np.mean(off):.1f} degrees off a joint, on average; lowest quality at the end {result.quality:.2f}")
+        figure(f"whole person, {cameras}: CPU time a frame", told.ms, unit, goal)
+        print(f"  {told.degrees:.1f} degrees off a joint, on average; lowest quality at the end {told.quality:.2f}")

@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy.images.silhouettes_track import take_text
 from benchmarks.figures import amount, figure, recording
-from benchmarks.scenes.balancing import seen_of, tracked
 from benchmarks.scenes.silhouettes_scene import of_meshes, ring, swaying
+from benchmarks.scenes.takes import seen_of, tracked
+from benchmarks.timing import timed
 from kinefit.bodies import Body, load_body
 from kinefit.bodies.rendering import Canvas, lens_of, render_body
 from kinefit.bodies.surfaces.places import body_mesh
@@ -119,9 +120,8 @@ def _real(rendered_ms: float) -> None:
         tracker.start_at(start.state(0))
         used = []
         for frames in masks:
-            began = time.process_time()
-            result = tracker.update(frames)
-            used.append(1e3 * (time.process_time() - began))
+            with timed(used, 1e3):
+                result = tracker.update(frames)
             assert result is not None
             iterations += result.iterations
         rounds.append(used[WARM:])
@@ -151,11 +151,9 @@ def _frame_ms(body: Body, rig: Rig, pictures: list[dict[str, np.ndarray]], count
     tracker.start_at(truth[0])
     spent, used, off = [], [], []
     for i, seen in enumerate(pictures):
-        start = time.perf_counter(), time.process_time()
-        masks = {n: colour_mask(seen[n], (150, 20, 20), (255, 100, 100)) for n in rig.names[:count]}
-        result = tracker.update([SilhouetteFrame(name, i / 30.0, mask) for name, mask in masks.items()])
-        spent.append(1e3 * (time.perf_counter() - start[0]))
-        used.append(1e3 * (time.process_time() - start[1]))
+        with timed(spent, 1e3, clock=time.perf_counter), timed(used, 1e3):
+            masks = {n: colour_mask(seen[n], (150, 20, 20), (255, 100, 100)) for n in rig.names[:count]}
+            result = tracker.update([SilhouetteFrame(name, i / 30.0, mask) for name, mask in masks.items()])
         assert result is not None
         off.append(np.degrees(np.abs(result.state.angles - truth[i].angles)).mean())
     return float(np.median(spent[WARM:])), np.array(used[WARM:]), float(np.mean(off[-10:]))
@@ -167,12 +165,12 @@ def _renderers(body: Body, rig: Rig) -> None:
     states = swaying(body, 20)
     x = np.array([mesh.posed(body.tree.forward(s.T_world_root, s.angles)[0]) @ R.T + t for s in states])
     lens, canvas = lens_of(camera), Canvas(camera.size)
-    best = np.inf
+    spent: list[float] = []
     for _ in range(5):
-        start = time.process_time()
-        for vertices in x:
-            canvas.draw(vertices, mesh.faces, lens, cull=True)
-        best = min(best, 1e3 * (time.process_time() - start) / len(x))
+        with timed(spent, 1e3 / len(x)):
+            for vertices in x:
+                canvas.draw(vertices, mesh.faces, lens, cull=True)
+    best = min(spent)
     print(f"# kinefit {best:.2f} ms a drawing")
     peers = (("OpenGL in software", "KINEFIT_MODERNGL_PYTHON", _GL, ">= 3"),
              ("Embree's rays", "KINEFIT_EMBREE_PYTHON", _EMBREE, ">= 5"))  # fmt: skip

@@ -7,7 +7,6 @@ import os
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from benchmarks.figures import LEFT_OUT, NotMeasured, amount, figure, peers, qui
 from benchmarks.peers import EXCESS, write_problem
 from benchmarks.peers.environments import run_peer
 from benchmarks.scenes.motions import library
+from benchmarks.timing import fastest
 from kinefit import Motion, load_body
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.fitting.initialization.from_points import aligned_root
@@ -93,11 +93,7 @@ def least(fit: Callable[[float], SequenceFit]) -> tuple[float, float, float]:
     """CPU seconds (least of several) at the loosest tolerance within EXCESS of the tightest cost; cost; iterations."""
     best = fit(1e-12).costs.sum()
     tolerance = next(t for t in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-12) if cost_of(fit, t) <= best * (1 + EXCESS))
-    seconds = np.inf
-    for _ in range(REPEATS):
-        began = time.process_time()
-        result = fit(tolerance)
-        seconds = min(seconds, time.process_time() - began)
+    result, seconds = fastest(lambda: fit(tolerance), REPEATS)
     return seconds, float(result.costs.sum()), float(result.iterations.mean())
 
 

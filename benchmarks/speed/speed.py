@@ -8,26 +8,25 @@ the median. One body of cylinders and ellipsoids, default settings; the first fr
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
 from benchmarks.scenes.silhouettes_scene import ring, swaying
 from benchmarks.speed.regions_speed import pictures
+from benchmarks.speed.rounds import Rounds, tracked_rounds
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.rendering import render_body
 from kinefit.bodies.surfaces.places import body_mesh
-from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import ColourFrame, DepthFrame, KeypointFrame, MarkerFrame, SilhouetteFrame
 
 FRAMES, WARM, ROUNDS, RATE = amount(40, 6), amount(5, 2), amount(4, 1), 30.0
 CAMERAS = amount((1, 2, 4, 8), (1, 2))
 WALL = 4.5  # [m] from each camera
+_HOW = {"rate": RATE, "rounds": ROUNDS, "warm": WARM}
 GOALS = {"keypoints": ">= 100", "masks": ">= 30", "colours": ">= 30", "depth": ">= 30", "markers": ">= 300"}
 """Frames a second with four cameras; of markers with their system."""
 
@@ -46,38 +45,18 @@ def run() -> None:
         empty = [np.full(camera.size[::-1], WALL) for camera in own] if name == "depth" else []
         for count in CAMERAS:
             seen = [[f for f in step if f.sensor in own.names[:count]] for step in frames]
-            each[count] = spent(body, Rig(own.cameras[:count]), truth, seen, empty[:count])
+            each[count] = tracked_rounds(body, Rig(own.cameras[:count]), truth, seen, empty=empty[:count], **_HOW)
         table(name, each, "cameras")
-    with_markers = {1: spent(body, rig, truth, markers(body, truth), [])}
+    with_markers = {1: tracked_rounds(body, rig, truth, markers(body, truth), **_HOW)}
     table("markers", with_markers, "system")
 
 
-def table(name: str, each: dict[int, tuple[float, float]], of: str) -> None:
+def table(name: str, each: dict[int, Rounds], of: str) -> None:
     """One row: frames a second, and what a camera more costs."""
-    told = ", ".join(f"{count} {of} {1e3 / ms:.0f} frames/s ({ms:.2f} ms)" for count, (ms, _) in each.items())
-    print(f"# {name}: {told}; at most {max(off for _, off in each.values()):.1f} degrees off a joint, on average")
+    told = ", ".join(f"{count} {of} {1e3 / ms:.0f} frames/s ({ms:.2f} ms)" for count, (ms, *_) in each.items())
+    print(f"# {name}: {told}; at most {max(one.degrees for one in each.values()):.1f} degrees off a joint, on average")
     four = each.get(4, each[max(each)])
-    figure(f"speed_{name}", 1e3 / four[0], "frames/s", GOALS[name])
-
-
-def spent(
-    body: Body, rig: Rig, truth: Sequence[BodyState], seen: Frames, empty: Sequence[NDArray]
-) -> tuple[float, float]:
-    """[ms] of a frame; degrees off a joint, on average."""
-    rounds, off = [], []
-    for _ in range(ROUNDS):
-        tracker, times = Tracker(body, rig, rate=RATE, up="y"), []
-        for camera, image in zip(rig, empty):
-            tracker.know_background(camera.name, image)
-        tracker.start_at(truth[0])
-        for state, frames in zip(truth, seen):
-            began = time.process_time()
-            result = tracker.update(frames)
-            times.append(1e3 * (time.process_time() - began))
-            assert result is not None
-            off.append(np.degrees(np.abs(result.state.angles - state.angles)).mean())
-        rounds.append(times)
-    return float(np.median(np.min(rounds, axis=0)[WARM:])), float(np.mean(off))
+    figure(f"speed_{name}", 1e3 / four.ms, "frames/s", GOALS[name])
 
 
 def by_cameras(truth: Sequence[BodyState], rig: Rig, frame: Callable[[Camera, BodyState, float], Any]) -> Frames:

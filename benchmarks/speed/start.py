@@ -13,7 +13,9 @@ import tempfile
 import time
 from pathlib import Path
 
+from benchmarks.commands import used
 from benchmarks.figures import LEFT_OUT, amount, figure, quick, recording
+from benchmarks.timing import took
 
 _TAKE = """
 import sys
@@ -47,23 +49,18 @@ def run() -> None:
         first = None if quick() else _first(take, kernels)
         figure("start_first", first, "s", names["start_first"], LEFT_OUT)
         figure("start_later", min(_first(take, kernels) for _ in range(amount(3, 1))), "s", names["start_later"])
-        command = [sys.executable, "-m", "kinefit", "track", str(take), "--out", str(Path(work) / "out")]
+        words = ["track", take, "--out", Path(work) / "out"]
         if not quick():  # also what only the writing of results needs is compiled
-            subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=kernels)
-        runs = [_whole(command, kernels) for _ in range(amount(2, 1))]
+            used(*words, env=kernels)
+        runs = [_whole(words, kernels) for _ in range(amount(2, 1))]
         figure("track_trial", min(seconds for seconds, _ in runs), "s", names["track_trial"])
         figure("track_trial_memory", max(memory for _, memory in runs), "MB", "<= 700")
 
 
-def _whole(command: list[str], environment: dict[str, str]) -> tuple[float, float]:
+def _whole(words: list[object], environment: dict[str, str]) -> tuple[float, float]:
     """[s] that a command takes, and [MB] of memory at most."""
-    began = time.perf_counter()
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
-    _, status, used = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise RuntimeError(f"{' '.join(command)} ended with code {process.returncode}")
-    return time.perf_counter() - began, used.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+    (_, memory), seconds = took(lambda: used(*words, env=environment), clock=time.perf_counter)
+    return seconds, memory
 
 
 def _first(take: Path, environment: dict[str, str]) -> float:

@@ -154,7 +154,7 @@ def parse_toml(
     Raises
     ------
     `error`
-        No TOML, with line and column; or tables so deep, keys or numbers so long that nobody wrote them.
+        No TOML, with line and column; or tables so deep, keys or numbers longer than a person writes.
     """
     text = text.removeprefix("\ufeff")  # that some editors of Windows begin a file with
     if len(text) > _MAX_TOML_CHARACTERS:
@@ -342,7 +342,7 @@ _REMEDIES = {
 
 @contextmanager
 def writing(path: str | PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path beside `path`; what was written there takes its place when the block ends well.
+    """Give a temporary path next to `path`; what was written there takes its place when the block ends well.
 
     Folders on the way are made. After any error, Ctrl-C included, nothing new is left and an older file stays; what a
     process left that was killed, the next one that writes there removes.

@@ -52,5 +52,5 @@ def release(*arrays: NDArray | None) -> None:
         if isinstance(owner, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
             owner.madvise(mmap.MADV_DONTNEED)
             some = True
-    if some and _trim is not None:  # what was computed from them is gone, and left holes that nobody gives back
+    if some and _trim is not None:  # what was computed from them is gone, and left holes that are not given back
         _trim(0)

@@ -51,9 +51,9 @@ def ahead(things: Iterable[T]) -> Iterator[T]:
         return
     source = iter(things)
     with ThreadPoolExecutor(1) as pool:
-        coming = pool.submit(_next, source)
-        while found := coming.result():
-            coming = pool.submit(_next, source)
+        following = pool.submit(_next, source)
+        while found := following.result():
+            following = pool.submit(_next, source)
             yield found[0]
 
 

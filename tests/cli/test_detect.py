@@ -15,6 +15,7 @@ from kinefit.cli.detect import detect
 from kinefit.errors import AssetError, FileError, KinefitError, ObservationError, TakeError
 from kinefit.exporters.motion_file import write_detections
 from kinefit.images.detectors.box_detector import DetectedPerson
+from kinefit.images.detectors.layouts import BLAZEPOSE
 from kinefit.images.detectors.roi import SIZE, PersonLandmarks
 from kinefit.observations import Detections
 from kinefit.readers.landmarks.detections import detections_file, read_detections
@@ -31,7 +32,7 @@ CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 class Networks:
     """See one person in the middle of every picture that is not quite black; count the pictures."""
 
-    pictures = 0
+    pictures, layout = 0, BLAZEPOSE
     lock = threading.Lock()
 
     def __init__(self, folder, threads=1, landmarks=None, *, mirrored=False):
@@ -284,7 +285,7 @@ def test_the_licence_is_shown_when_the_networks_are_fetched(monkeypatch, tmp_pat
     detecting.networks(None, pytest.fail)  # nothing is said when they are there already
 
 
-@pytest.mark.parametrize(("quality", "file"), [("balanced", "full"), ("best", "heavy")])
+@pytest.mark.parametrize(("quality", "file"), [("balanced", "full"), ("auto", "heavy"), ("best", "heavy")])
 def test_a_quality_is_a_landmark_network(monkeypatch, tmp_path, quality, file):
     monkeypatch.undo()
     pytest.importorskip("ai_edge_litert")

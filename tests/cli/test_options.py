@@ -130,6 +130,7 @@ OWN = {
         "sigma": "sigma = 20.0", "frames": "frames = [0, 3]", "rate": "rate = 15.0", "set": 'set = "BODY_25"',
         "frame": 'frame = "calibration"', "face": "face = [1.0, 1.0, 9.0, 9.0]",
         "stream": 'stream = "coming"', "excluded": "excluded = [[1, 3], [4, 5]]", "swapped": "swapped = [[0, 2]]",
+        "names": 'names = { a = "left_knee" }',
     },
     "markers": {
         "sigma": "sigma = 0.05", "unit": 'unit = "mm"', "set": 'set = "no such"', "model": 'model = "none.npz"',

@@ -223,7 +223,7 @@ def test_formats_may_stand_apart():
     [("up = ", 'unit = "mm"\nup = ', "'unit' belongs to [calibration], [[markers]], [[depth]]"),
      ("rate = 30.0", "rate = 35.0", "Remove rate from [take]: the videos state theirs"),
      ("[[camera]]", "[camera]", "write [[camera]], the first one too"),
-     ('format = "mediapipe"', 'format = "openpose"', '.npy files are of format = "mediapipe"'),
+     ('format = "mediapipe"', 'format = "openpose"', 'Write format = "mediapipe"'),
      ("mediapipe_cam02.npy", "mediapipe_cam01.npy", "mediapipe_cam01.npy is also the file of camera cam02"),
      ("cam02.mp4", "cam01.mp4", "cam01.mp4 is also the file of camera cam02"), ("", TWICE, "the same file twice")],
 )  # fmt: skip

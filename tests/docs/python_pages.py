@@ -3,7 +3,6 @@
 A page's function is a generator: it yields the names that its next block needs, and is sent all names after that block.
 """
 
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -20,7 +19,6 @@ from kinefit.bodies.parts import free_parts, parts_state
 from kinefit.exporters import write_markers, write_motion
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, KeypointFrame, PointCloud
-from kinefit.readers.landmarks.keypoints import read_keypoints
 from kinefit.simulation import simulate_keypoints
 
 
@@ -232,17 +230,6 @@ def surfaces(folder):
     yield {"x": x}
 
 
-def take_file(folder):
-    drawn.write_recording(folder)
-    (folder / "cam01.mp4").rename(folder / "cam1.mp4")
-    people = [{"image_id": f"{i}.jpg", "keypoints": [10.0 + i, 20.0, 0.9] * 17} for i in (0, 2, 2)]
-    (folder / "alphapose-results.json").write_text(json.dumps(people))
-    yield {}
-    seen = read_keypoints(folder / "cam1_json", camera="cam01", rate=drawn.RATE)
-    assert seen.points.shape == (drawn.FRAMES, 2, 17, 2) and seen.keypoint_set == "COCO_17"
-    assert seen.confidence.any(axis=2).sum(axis=1).tolist() == [1, 0, 2] + (drawn.FRAMES - 3) * [0]
-
-
 def view(folder):
     w = world()
     frames = [(float(t), w.motion.state(i), {}) for i, t in enumerate(w.motion.times[:3])]
@@ -266,7 +253,7 @@ PREPARED = {
     "motion": motion, "own-sensor": own_sensor, "depth": depth_fusion,
     "printed-metaballs": printed_metaballs, "printed-regions": printed_regions, "regions": regions,
     "report": report, "rows": rows, "printed-sapm": sapm, "silhouettes": silhouettes, "simulate": simulate,
-    "smoothing": smoothing, "solvers": solvers, "stereo": stereo, "surfaces": surfaces, "take-file": take_file,
+    "smoothing": smoothing, "solvers": solvers, "stereo": stereo, "surfaces": surfaces,
     "view": view,
     "printed-voodoo": voodoo,
 }  # fmt: skip

@@ -12,6 +12,7 @@ from kinefit.bodies import load_body
 from kinefit.bodies.marker_sets import placement
 from kinefit.cli import main
 from kinefit.readers.landmarks.annotations import read_static_points
+from kinefit.readers.landmarks.networks import read_description
 from kinefit.readers.take.entries import TABLES
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.kinds import BUILT_IN
@@ -47,6 +48,8 @@ def whole(text):
         base = "snowboarder" if "dimension" in keys else "humanoid"
         base = str(GOLF) if "club_head" in text else base
         return "body", f'[body]\nname = "changed"\nbase = "{base}"\n{text}'
+    if "mapping" in keys:
+        return "network", text
     if keys == {"skin"}:
         return "body", SEGMENT + text
     return ("marker set" if "markers" in keys else "points"), text
@@ -76,6 +79,8 @@ def read(kind, text, folder):
         return take if "body" not in content.get("take", {}) else load_body(take.body)
     if kind == "body":
         return load_body(path)
+    if kind == "network":
+        return read_description(path.with_suffix(".onnx"))
     if kind == "marker set":
         return placement(load_body("humanoid"), path)
     return read_static_points(path, ("cam01", "cam03"))

@@ -5,11 +5,14 @@ import numpy as np
 import pytest
 
 from kinefit.images.detectors.box_detector import DetectedPerson
+from kinefit.images.detectors.layouts import BLAZEPOSE
 from kinefit.images.detectors.roi import SIZE, PersonLandmarks
 
 
 class DiscModels:
     """Finds discs: the middle of the hips is the disc's centre, the rim of the body 1.2 radii above it."""
+
+    layout = BLAZEPOSE
 
     def __init__(self, *, only_one=True):
         self.only_one = only_one  # as the true detector, which overlooks those beside another

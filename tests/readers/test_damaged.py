@@ -101,7 +101,7 @@ def caliscope(path, *rows):
     ("row", "told"),
     [("1e11,0,0.1,3,5,6", "sync_index = 1e+11"), ("3,0,0.1,-1,5,6", "point_id = -1"),
      ("3,0,0.1,2.5,5,6", "point_id = 2.5"),
-     ("90000000,0,0.1,3,5,6", "2 frames of 1 ports in 90000001"), ("0,-2,0.1,3,5,6", "port = -2")],
+     ("90000000,0,0.1,3,5,6", "2 frames in 90000001 of sync_index"), ("0,-2,0.1,3,5,6", "port = -2")],
 )  # fmt: skip
 def test_indices_of_a_table_that_cannot_be_are_told(tmp_path, row, told):
     with pytest.raises(ObservationError, match=told.replace("+", r"\+")):
@@ -288,7 +288,7 @@ def test_a_morph_of_a_segment_without_a_name_is_told(tmp_path):
 
 def test_a_camera_of_five_thousand_digits_is_none_of_a_table(tmp_path):
     path = caliscope(tmp_path / "xy.csv", "0,0,0.0,3,5,6", "1,0,0.1,3,5,6")
-    with pytest.raises(ObservationError, match="no camera in this table") as error:
+    with pytest.raises(ObservationError, match="no camera in this file") as error:
         read_keypoints(path, format="caliscope", camera="cam" + "9" * 5000, rate=10.0)
     assert len(str(error.value).replace(str(tmp_path), "")) <= LONGEST
 

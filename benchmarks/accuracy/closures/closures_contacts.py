@@ -22,11 +22,12 @@ from kinefit.fitting.tracking.video import track
 from kinefit.solving.rows import ParameterRows
 
 SEEDS = (11, 12, 13)
+SECONDS = 3.2  # of a take, with two jumps in it
 STANDS = 0.005
 """[m] above the ground to which a foot counts as standing."""
 
 
-def jumper(seed: int, *, seconds: float = 3.2) -> Take:
+def jumper(seed: int) -> Take:
     """Somebody who jumps on the spot twice, by about 30 cm."""
     random = np.random.default_rng(seed)
     generic = load_body("humanoid")
@@ -51,7 +52,7 @@ def jumper(seed: int, *, seconds: float = 3.2) -> Take:
             posture[names.index(f"arm_flex_{side}")] += 0.5 * np.sin(4.0 * t)
         return replace(person, closures=feet), towards(person, posture), {}
 
-    return from_drive(generic, drive, seconds, 4, seed, of=person)
+    return from_drive(generic, drive, SECONDS, 4, seed, of=person)
 
 
 def run() -> None:

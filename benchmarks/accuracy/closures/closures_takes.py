@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount
+from benchmarks.scenes.simulated import without
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.parts import with_dimensions
@@ -18,7 +19,7 @@ from kinefit.fitting.tracking.recording import Recording
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.settings import TrackSettings
-from kinefit.simulation import simulate_keypoints, studio_rig
+from kinefit.simulation import known_motion, simulate_keypoints, studio_rig
 from kinefit.solving.closed import CLOSED, closed_fit
 from kinefit.solving.correspondences import prior_rows
 from kinefit.solving.correspondences.closures import closed_at
@@ -194,7 +195,8 @@ def from_drive(
     for f in range(frames):
         body, towards, driven = drive(begin + f / rate)
         states.append(_solved(body, towards, driven, states[-1] if states else None))
-    motion = _motion(body if of is None else of, states, rate)
+    roots, angles = (np.stack([getattr(s, name) for s in states]) for name in ("T_world_root", "angles"))
+    motion = known_motion(body if of is None else of, rate, roots, angles)
     rig = studio_rig(motion, cameras=cameras, up="y")
     seen = simulate_keypoints(
         motion, rig, points, noise_px=noise, drift_px=DRIFT, outliers=0.03, missing=0.05, seed=seed
@@ -202,7 +204,7 @@ def from_drive(
     hidden = np.zeros(frames, bool)
     if leg:
         hidden[frames // 4 : 3 * frames // 4] = True
-        seen = [_without(k, hidden) for k in seen]
+        seen = [without(k, hidden, [k.names.index(name) for name in LEG]) for k in seen]
     recording = Recording.of_keypoints(calibrated(rig, seed), seen, sigma=noise, up="y")
     return Take(motion, generic, recording, hidden)
 
@@ -214,15 +216,6 @@ def calibrated(rig: Rig, seed: int) -> Rig:
         return rig
     twists = random.normal(size=(len(rig), 6)) * np.repeat(std, 3)
     return Rig(tuple(c.with_pose(se3.exp(xi) @ c.T_camera_world) for c, xi in zip(rig, twists)))
-
-
-def _without(k, hidden: NDArray):
-    """Keypoints of a camera that sees nothing of the left leg in some frames."""
-    points, confidence = np.array(k.points), np.array(k.confidence)
-    for name in LEG:
-        points[hidden, :, k.names.index(name)] = np.nan
-        confidence[hidden, :, k.names.index(name)] = 0.0
-    return replace(k, points=points, confidence=confidence)
 
 
 def _solved(body: Body, towards: ParameterRows, driven: dict[int, float], last: BodyState | None) -> BodyState:
@@ -262,13 +255,3 @@ def _solved(body: Body, towards: ParameterRows, driven: dict[int, float], last: 
     fit = closed_fit(body, last, rows, constraint, max_iterations=30, tolerance=1e-5)
     assert np.abs(constraint(fit.state)[0]).max() <= CLOSED, "a pose that is not closed"
     return fit.state
-
-
-def _motion(body: Body, states: list[BodyState], rate: float) -> Motion:
-    count = len(states)
-    return Motion(
-        body, rate, np.arange(count) / rate, np.stack([s.T_world_root for s in states]),
-        np.stack([s.angles for s in states]), np.zeros((count, body.tree.n_dofs)),
-        np.zeros((count, len(body.tree.segments), 3)), np.ones(count), np.ones((count, len(body.tree.segments))),
-        up="y",
-    )  # fmt: skip

@@ -11,9 +11,9 @@ edges, on slanted surfaces and by chance. Settings were chosen on odd numbers, f
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -21,7 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
-from kinefit import load_body, track_take
+from benchmarks.scenes.takes import tracked
+from benchmarks.timing import took
+from kinefit import load_body
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.motion import BELIEVED, Motion
 from kinefit.bodies.surfaces import TaperedCylinder
@@ -83,9 +85,8 @@ def run() -> None:
     asked, spent = [], []
     for seed in range(0, 2 * TAKES, 2):
         take = near_take(seed)
-        begin = time.process_time()
-        motion = tracked(take)
-        spent.append((time.process_time() - begin) / len(take.images))
+        motion, seconds = took(partial(motion_of, take))
+        spent.append(seconds / len(take.images))
         g, gone = errors(take, motion)
         gaps, lost = [*gaps, g], [*lost, gone]
         asked.append([[part in seen for part in _PARTS] for seen in take.seen])
@@ -104,7 +105,7 @@ def run() -> None:
     figure("depth_near_seconds_worst", float(np.max(spent)), "s CPU an image, slowest take", "<= 8")
 
 
-def tracked(take: NearTake) -> Motion:
+def motion_of(take: NearTake) -> Motion:
     """Its motion by `track_take` with defaults, in the camera's frame."""
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work) / "images"
@@ -112,9 +113,7 @@ def tracked(take: NearTake) -> Motion:
         for k, depth in enumerate(take.images):
             cv2.imwrite(str(folder / f"{k}.png"), np.rint(depth / UNIT).astype(np.uint16))
         K = take.camera.matrix
-        path = Path(work) / "take.toml"
-        path.write_text(_TAKE.format(rate=RATE, folder=folder, unit=UNIT, f=K[0, 0], cx=K[0, 2], cy=K[1, 2]))
-        return track_take(path)[0]
+        return tracked(_TAKE.format(rate=RATE, folder=folder, unit=UNIT, f=K[0, 0], cx=K[0, 2], cy=K[1, 2]))[0]
 
 
 def errors(take: NearTake, motion: Motion) -> tuple[NDArray, NDArray]:
@@ -135,11 +134,11 @@ def errors(take: NearTake, motion: Motion) -> tuple[NDArray, NDArray]:
     return gap, lost > 0
 
 
-def near_take(seed: int, count: int = IMAGES) -> NearTake:
+def near_take(seed: int) -> NearTake:
     """Images and truth of a number."""
     rng = np.random.default_rng([seed, 32])
     body = _person(rng)
-    states = _states(body, rng, count)
+    states = _states(body, rng, IMAGES)
     roots, angles = np.array([s.T_world_root for s in states]), np.array([s.angles for s in states])
     truth = known_motion(body, RATE, roots, angles)
     T = np.diag([1.0, -1.0, -1.0, 1.0])  # at the origin, looks along -z
@@ -148,7 +147,7 @@ def near_take(seed: int, count: int = IMAGES) -> NearTake:
     folds = rng.normal(size=(3, 4)), rng.uniform(15.0, 60.0, (3, 4, 3)), rng.uniform(0.0, 6.3, (3, 4))
     fist = {"r": rng.random() < 0.35, "l": rng.random() < 0.35}
     images, seen = [], []
-    for k in range(count):
+    for k in range(IMAGES):
         mesh = _dressed(body, fist, folds)
         scene = SimulatedScene(truth, mesh, room)
         depth = measured_depth(scene, k, camera, SR305, rng)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import NotMeasured, figure
+from benchmarks.timing import timed
 from kinefit.bodies.rendering import Canvas, render_body
 from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.geometry.camera import Camera
@@ -62,13 +63,12 @@ def drawn_ms(motion, mesh, camera: Camera) -> float:  # type: ignore[no-untyped-
     """CPU time [ms] of one image, vertices given in the world; the least of a few rounds over some frames."""
     canvas, posed = Canvas(camera.size), _posed(motion, mesh)
     canvas.draw_for(camera, posed[0], mesh.faces, cull=True)
-    best = np.inf
+    spent: list[float] = []
     for _ in range(REPEATS):
-        start = time.process_time()
-        for vertices in posed:
-            canvas.draw_for(camera, vertices, mesh.faces, cull=True)
-        best = min(best, time.process_time() - start)
-    return 1e3 * best / len(posed)
+        with timed(spent, 1e3 / len(posed)):
+            for vertices in posed:
+                canvas.draw_for(camera, vertices, mesh.faces, cull=True)
+    return min(spent)
 
 
 def _posed(motion, mesh) -> NDArray:  # type: ignore[no-untyped-def]

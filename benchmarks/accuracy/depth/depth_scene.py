@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import resource
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -30,6 +29,7 @@ from benchmarks.papers.regions.scene_body10 import (
     load_scene,
     run_scene,
 )
+from benchmarks.peers.environments import measured
 
 STARTS, SEEDS, PASSES = range(10, 300, amount(29, 145)), range(amount(3, 1)), 3
 NEVER = 999.0  # [s] for a part that is not found again
@@ -146,17 +146,16 @@ def started(
 
 def _speed() -> dict[str, float]:
     """CPU time a frame on one thread, and what a process needs to its first state; in processes of their own."""
-    one = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     out: dict[str, float] = {}
     for what in ("startup", "cpu", "startup"):  # the first fills the cache of compiled kernels
         begin = time.monotonic()
         command = [sys.executable, "-m", "benchmarks.accuracy.depth.depth_scene", what]
-        done = subprocess.run(command, env=os.environ | one, capture_output=True, text=True, timeout=600)
-        if done.returncode:
+        found, reason, _ = measured(command, os.environ, 600.0)
+        if reason:
             FAILED.append(f"depth_scene {what}")
-            print(f"# {what}: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")
+            print(f"# {what}: {reason}")
             continue
-        out |= json.loads(done.stdout.splitlines()[-1])
+        out |= found
         if what == "startup":
             out["startup_s"] = time.monotonic() - begin
     return out

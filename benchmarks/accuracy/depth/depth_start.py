@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
+from benchmarks.timing import timed
 
 _POSES, _NEAR = amount(16, 2), 0.1  # [m] a joint this near its true place is found
 _PEOPLE = amount(20, 1)
@@ -63,21 +63,11 @@ def camera_in_front(sensor: Any) -> Any:
 def seen(body: Any, states: list[Any], camera: Any, sensor: Any, *, room: bool) -> list[NDArray]:
     """The depth image of each state."""
     from kinefit.simulation.rendering.sensors import simulate_depth
-
-    video = simulate_depth(_motion(body, states), camera, sensor, room=room)
-    return [video.frame(k).depth for k in range(len(states))]
-
-
-def _motion(body: Any, states: list[Any]) -> Any:
-    from kinefit.bodies.motion import Motion
+    from kinefit.simulation.retarget import known_motion
 
     roots, angles = np.array([s.T_world_root for s in states]), np.array([s.angles for s in states])
-    count, parts = len(states), len(body.tree.segments)
-    return Motion(
-        body=body, rate=1.0, times=np.arange(count, dtype=float), Ts_world_root=roots, angles=angles,
-        dof_std=np.zeros((count, body.tree.n_dofs)), joint_std=np.zeros((count, parts, 3)), quality=np.ones(count),
-        segment_quality=np.ones((count, parts)), up="y",
-    )  # fmt: skip
+    video = simulate_depth(known_motion(body, 1.0, roots, angles), camera, sensor, room=room)
+    return [video.frame(k).depth for k in range(len(states))]
 
 
 def joints(body: Any, state: Any) -> NDArray:
@@ -98,9 +88,8 @@ def _recovered(body: Any) -> None:
         truth = [random_state(body, np.random.default_rng(100 + i), sitting=seat) for i, seat in enumerate(seats)]
         found, spent = [], []
         for depth, state in zip(seen(body, truth, camera, KINECT, room=room), truth):
-            begin = time.process_time()
-            start = start_from_points(body, None, camera, depth, up=_UP)[0]
-            spent.append(time.process_time() - begin)
+            with timed(spent):
+                start = start_from_points(body, None, camera, depth, up=_UP)[0]
             found.append(np.linalg.norm(joints(body, start.state) - joints(body, state), axis=1) < _NEAR)
         rate = np.mean(found, axis=1)
         figure(f"start_recovered{suffix}", float(np.mean(rate)), f"of joints within 100 mm, {count} poses", ">= 0.9")

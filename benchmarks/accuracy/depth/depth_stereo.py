@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import NotMeasured, amount, data, each, figure, recording
+from benchmarks.timing import timed, took
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces.places import sample
 from kinefit.geometry import se3
@@ -25,6 +25,7 @@ from kinefit.solving.correspondences.occupancy.free_space import FreeSpace, Surf
 
 PAIRS = amount((1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14), (1, 5, 9))
 SQUARE = 0.025  # [m]
+REPEATS = 100  # of work whose median time is told
 
 
 def run() -> None:
@@ -32,15 +33,10 @@ def run() -> None:
     each(_board, _head, _skin, _space)
 
 
-def _cpu(work: Callable[[], object], repeats: int = 100) -> float:
+def _cpu(work: Callable[[], object]) -> float:
     """[ms] CPU time of a call, the median of many."""
     work()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        times.append(time.process_time() - start)
-    return 1e3 * float(np.median(times))
+    return 1e3 * float(np.median([took(work)[1] for _ in range(REPEATS)]))
 
 
 def _board() -> None:
@@ -83,24 +79,21 @@ def _head() -> None:
     """A walking person before a simulated stereo head, 3 m away."""
     folder = recording("motion_cmu_bvh")
     from kinefit.readers.skeletons.bvh import read_bvh
+    from kinefit.simulation.figures import look_at
     from kinefit.simulation.rendering.scenes import STEREO, SimulatedScene, picture
     from kinefit.simulation.retarget import retarget
 
     motion = retarget(read_bvh(sorted(folder.glob("*.bvh"))[0]), rate=2)
-    off, found, spent = [], [], 0.0
+    off, found, spent = [], [], list[float]()
     for frame in range(1, len(motion.angles), amount(2, 20)):
         aim = motion.Ts_world_root[frame][:3, 3]
         place = aim + (0.3, 0.2, 3.0)
-        z = (aim - place) / np.linalg.norm(aim - place)
-        x = np.cross(z, (0.0, 1.0, 0.0)) / np.linalg.norm(np.cross(z, (0.0, 1.0, 0.0)))
-        R = np.stack([x, np.cross(z, x), z])
-        left, right = STEREO.pair(STEREO.camera(se3.transform(R, -R @ place)))
+        left, right = STEREO.pair(STEREO.camera(look_at(place, aim, np.array([0.0, 1.0, 0.0]))))
         scene = SimulatedScene.of(motion, left)
         images = [picture(scene, frame, c, STEREO, grey=True) for c in (left, right)]
         pair = StereoRectifier(left, right, near=1.0, far=8.0)
-        start = time.process_time()
-        depth = pair.depth(*images)
-        spent += time.process_time() - start
+        with timed(spent):
+            depth = pair.depth(*images)
         view = scene.view(frame, pair.camera)
         body = (view.raster.face >= 0) & (scene.labels[view.raster.face] < len(motion.body.tree.segments))
         seen = body & (depth > 0)
@@ -108,7 +101,7 @@ def _head() -> None:
         off.append((depth - view.raster.depth)[seen] / pair.deviation(3.0, 1.0))
     figure("stereo head, depth of the body at 3 m", float(np.median(np.abs(np.concatenate(off)))), "px", "<= 0.25")
     figure("stereo head, body pixels found", 100 * float(np.mean(found)), "%", ">= 90")
-    figure("stereo head, CPU a 320x240 pair", 1e3 * spent / len(off), "ms", "<= 33")
+    figure("stereo head, CPU a 320x240 pair", 1e3 * sum(spent) / len(off), "ms", "<= 33")
 
 
 def _skin() -> None:
@@ -141,7 +134,7 @@ def _skin() -> None:
 
 def _gestures(folder: Path, port: int, models: object) -> tuple[NDArray, float]:
     """(N, 2): 0 for the face and 1 for a hand, and how far it is from where the networks see it; NaN for unseen."""
-    from kinefit.images.detectors.detection import Follower
+    from kinefit.images.detectors.following import Follower
     from kinefit.images.detectors.skin import SkinTracker, find_face
     from kinefit.readers.videos.video import Video
 
@@ -153,9 +146,8 @@ def _gestures(folder: Path, port: int, models: object) -> tuple[NDArray, float]:
         tracker, size = SkinTracker(image, face, rate=6.0), np.array(video.size)
         for k in range(amount(60, 6)):  # then a board is held
             image = video.read(k)
-            start = time.process_time()
-            seen = tracker.update(image)
-            times.append(time.process_time() - start)
+            with timed(times):
+                seen = tracker.update(image)
             for person in follower.update(image):
                 for blob, points in zip(seen, ([0], [15, 17, 19], [16, 18, 20])):
                     middle = person.points[points].mean(axis=0)

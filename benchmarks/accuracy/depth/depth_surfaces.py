@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import figure
+from benchmarks.timing import timed
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces.closest._kernels_cylinder import nearest_on_cylinders, nearest_on_cylinders_exact
 from kinefit.bodies.surfaces.places import sample
@@ -42,14 +43,13 @@ def search(
     kernel: Callable[..., None], table: NDArray, frames: NDArray, x: NDArray, repeats: int = 50
 ) -> tuple[float, NDArray]:
     """Least time [ms] of a search, and the distances (N,) [m] found."""
-    n, least = x.shape[1], np.inf
+    n, spent = x.shape[1], list[float]()
     best, normal, segment, only = np.empty(n), np.zeros((3, n)), np.empty(n, np.int64), np.full(n, -1)
     for _ in range(repeats):
         best[:], segment[:] = BOUND, -1
-        began = time.perf_counter()
-        kernel(x, frames, table, only, best, normal, segment)
-        least = min(least, time.perf_counter() - began)
-    return 1e3 * least, best
+        with timed(spent, 1e3, clock=time.perf_counter):
+            kernel(x, frames, table, only, best, normal, segment)
+    return min(spent), best
 
 
 def in_chunks(kernel: Callable[..., None], table: NDArray, frames: NDArray, points: NDArray, size: int) -> float:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from benchmarks.figures import amount, data, figure, quick, recording
+from benchmarks.timing import timed
 from kinefit.fitting.multiview.association import choose_people
 from kinefit.geometry.camera import ImageFrame
 from kinefit.geometry.lines import triangulate
@@ -51,10 +52,8 @@ def _trial(trial: Path, folder: Path) -> None:
     videos = {name: trial / "videos" / f"{name}.mp4" for name in CAMERAS}
     walls, processor = [], []
     for _ in range(_RUNS):
-        wall, cpu = time.perf_counter(), time.process_time()
-        found = _detect(videos, folder)
-        walls.append(time.perf_counter() - wall)
-        processor.append(time.process_time() - cpu)
+        with timed(walls, clock=time.perf_counter), timed(processor):
+            found = _detect(videos, folder)
     frames = len(found[CAMERAS[0]])
     cores = min(detecting.cores(), len(CAMERAS))
     print(f"  {frames} frames of {len(CAMERAS)} cameras in {min(walls):.2f} s on {cores} cores, everything included")

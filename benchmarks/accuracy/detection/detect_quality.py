@@ -9,13 +9,13 @@ exchanged where that more than halves the frame's median distance.
 from __future__ import annotations
 
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, data, figure
+from benchmarks.timing import took
 from kinefit.errors import AssetError, ObservationError
 from kinefit.fitting.multiview.association import choose_people
 from kinefit.geometry.camera import ImageFrame, Rig
@@ -52,9 +52,8 @@ def _measured(trial: Path, quality: str) -> dict[str, float]:
             )
             for c in CAMERAS
         ]  # fmt: skip
-        spent = time.process_time()
-        detecting.detect(jobs, detecting.DetectionSettings(masks=False, quality=quality), tell=print)
-        spent = time.process_time() - spent
+        settings = detecting.DetectionSettings(masks=False, quality=quality)
+        _, spent = took(lambda: detecting.detect(jobs, settings, tell=print))
         found = [read_detections(job.file) for job in jobs]
     rig = read_calibration(trial / "Calib_refined_static.toml").select(CAMERAS)
     images = [ImageFrame.letterboxed(rig[c].size, f.size) for c, f in zip(CAMERAS, found)]

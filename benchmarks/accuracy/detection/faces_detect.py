@@ -16,7 +16,8 @@ from benchmarks.figures import amount, figure, recording
 from kinefit import load_body
 from kinefit.images.detectors.box_detector import Models
 from kinefit.images.detectors.detection import detect_people
-from kinefit.images.detectors.faces import HEAD, FaceFinder, FaceModels
+from kinefit.images.detectors.faces import FaceFinder, FaceModels
+from kinefit.images.detectors.layouts import BLAZEPOSE
 from kinefit.observations import MEDIAPIPE_478, Detections
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.videos.video import Video
@@ -55,7 +56,7 @@ def run() -> None:
     seen = np.isfinite(face).any(axis=(1, 3))  # (F, C)
     figure("faces_found", 100 * float((seen.sum(axis=1) >= 2).mean()), *_GOALS["faces_found"])
     off = np.stack([held_out(rig, face, c)[:, known] for c in range(4)])
-    of_pose = np.stack([held_out(rig, pose, c)[:, HEAD] for c in range(4)])
+    of_pose = np.stack([held_out(rig, pose, c)[:, BLAZEPOSE.head] for c in range(4)])
     for camera, mesh, head, share in zip(rig.names, off, of_pose, seen.mean(axis=0)):
         print(f"# {camera}: a face in {share:.0%}; {np.nanmedian(mesh):.1f} px, the pose's {np.nanmedian(head):.1f} px")
     print(f"# 95 % within {np.nanpercentile(off, 95):.1f} px; the pose's head {np.nanmedian(of_pose):.1f} px")

@@ -12,8 +12,6 @@ itself finds, with the right foot, is a figure of its own.
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -22,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.commands import ended
 from benchmarks.figures import amount, data, figure
 from kinefit.bodies.motion import Motion
 from kinefit.exporters.report.cycles import find_cycles, gait_numbers
@@ -138,8 +137,7 @@ def fitted(path: Path, mass: float | None = None) -> Motion:
     options = ["--static", str(static)] if static else []
     options += ["--mass", f"{mass}"] if mass else []
     with tempfile.TemporaryDirectory() as out:
-        command = [sys.executable, "-m", "kinefit", "markers", "fit", str(path), "-o", out, "--formats", "motion"]
-        subprocess.run([*command, *options], check=True, capture_output=True)
+        ended("markers", "fit", path, "-o", out, "--formats", "motion", *options, check=True)
         return read_motion(Path(out) / "motion.npz")
 
 

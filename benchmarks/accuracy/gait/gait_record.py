@@ -9,13 +9,12 @@ The files are those of `gait_events`, in each of which a foot meets the ground t
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 from benchmarks.accuracy.gait.gait_events import CHOSEN, PRINTED, file_of, fitted
+from benchmarks.commands import ended
 from benchmarks.figures import amount, data, figure
 from kinefit.exporters import write_motion
 
@@ -46,8 +45,7 @@ def run() -> None:
 
 def _counts(motions: list[Path]) -> tuple[int, int]:
     """Numbers of strides and of single steps in the record of motions; none without a record."""
-    command = [sys.executable, "-m", "kinefit", "gait", *map(str, motions), "--out", str(motions[0].parent / "gait")]
-    done = subprocess.run([*command, "--json"], capture_output=True, text=True)
+    done = ended("gait", *motions, "--out", motions[0].parent / "gait", "--json")
     if done.returncode:
         print(f"# {done.stderr.strip()}")
         return 0, 0

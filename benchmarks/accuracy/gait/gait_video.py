@@ -29,14 +29,14 @@ from benchmarks.accuracy.gait.gait_events import (
     print_events,
     print_held,
 )
-from benchmarks.accuracy.mixed.mixed_takes import camera_error, detected, marked, with_own_keypoints
+from benchmarks.accuracy.mixed.mixed_takes import detected, marked, with_own_points
 from benchmarks.figures import amount, figure
-from kinefit import Motion, track_take
+from benchmarks.scenes.simulated import calibrated, write_cameras
+from benchmarks.scenes.takes import tracked
+from kinefit import Motion
 from kinefit.errors import ObservationError
 from kinefit.exporters.c3d_file import write_markers
 from kinefit.exporters.gait.record import Stretch, gait_record
-from kinefit.geometry.camera import Rig
-from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.markers import read_markers
 from kinefit.simulation import known_motion, resampled, studio_rig
 
@@ -78,31 +78,23 @@ def run() -> None:
 def of_person(measured: Motion, random: np.random.Generator) -> Motion:
     """A measured walk as a person with own keypoints walks it."""
     even = resampled(measured.turned("y"), RATE)
-    return known_motion(with_own_keypoints(measured.body, random), RATE, even.Ts_world_root, even.angles)
+    return known_motion(with_own_points(measured.body, random), RATE, even.Ts_world_root, even.angles)
 
 
 def by_cameras(truth: Motion, draw: int, random: np.random.Generator) -> Motion:
     """A walk as four cameras measure it."""
     rig = studio_rig(truth, size=SIZE)
-    calibrated = Rig(tuple(camera.with_pose(camera_error(random) @ camera.T_camera_world) for camera in rig))
-    text = f'[take]\nrate = {RATE}\nup = "y"\n[calibration]\nfile = "calibration.toml"\n'
+    told = calibrated(rig, random)
     with tempfile.TemporaryDirectory() as folder:
-        write_calibration(calibrated, Path(folder) / "calibration.toml")
-        for name, points in zip(rig.names, detected(truth, rig, draw, cameras=rig.names)):
-            np.save(Path(folder) / f"{name}.npy", points)
-            text += f'[[camera]]\nname = "{name}"\n[[keypoints]]\ncamera = "{name}"\nformat = "mediapipe"\n'
-            text += f'file = "{name}.npy"\nrate = {RATE}\n'
-        (Path(folder) / "take.toml").write_text(text)
-        return track_take(Path(folder) / "take.toml")[0]
+        text = write_cameras(Path(folder), told, detected(truth, rig, draw, cameras=rig.names), RATE)
+        return tracked(text)[0]
 
 
 def by_markers(truth: Motion, random: np.random.Generator) -> Motion:
     """A walk as 45 markers measure it."""
     with tempfile.TemporaryDirectory() as folder:
         write_markers(replace(marked(truth, random), rate=RATE), Path(folder) / "markers.trc")
-        text = f'[take]\nrate = {RATE}\nup = "y"\n[[markers]]\nfile = "markers.trc"\n'
-        (Path(folder) / "take.toml").write_text(text)
-        return track_take(Path(folder) / "take.toml")[0]
+        return tracked(f'[take]\nrate = {RATE}\nup = "y"\n[[markers]]\nfile = "{folder}/markers.trc"\n')[0]
 
 
 def differences(truth: Motion, motion: Motion) -> dict[str, list[tuple[float, float]]]:

@@ -10,7 +10,6 @@ of a hand's size do not judge. One camera of the videos is 0.65 of a frame out o
 
 from __future__ import annotations
 
-import tempfile
 import warnings
 from pathlib import Path
 
@@ -19,15 +18,13 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, data, figure
 from benchmarks.scenes.held_out import left_over
+from benchmarks.scenes.takes import seen_of
 from kinefit import Keypoints, Recording, Rig, load_body, track
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.lines import triangulate_robust
 from kinefit.observations import MEDIAPIPE_33, MEDIAPIPE_75
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.landmarks.keypoints import read_caliscope_csv
-from kinefit.readers.take.file import read_take
-from kinefit.readers.take.load import load_observations
-from kinefit.takes.missing import prepared
 
 _NAME, _VIDEOS = "mv4_landmarks_caliscope", "mv4_upperbody_caliscope"
 _GESTURES = 60  # first images of the videos; then a board is held before the hands
@@ -71,13 +68,11 @@ def run() -> None:
 
 def _detected(videos: Path) -> tuple[Rig, dict[str, Keypoints]]:
     """The cameras of the recording of videos, and the built-in detector's points, hands with them."""
-    with tempfile.TemporaryDirectory() as work:
-        text = f'[take]\nrate = 6.0\nup = "z"\nbody = "humanoid_hands"\nframes = [0, {amount(_GESTURES, 12)}]\n'
-        text += f'[calibration]\nfile = "{videos / "config.toml"}"\n'
-        for k in range(4):
-            text += f'[[camera]]\nname = "cam_{k}"\nvideo = "{videos / f"port_{k}.mp4"}"\n'
-        (Path(work) / "take.toml").write_text(text)
-        found = load_observations(prepared(read_take(Path(work) / "take.toml"), tell=print))
+    text = f'[take]\nrate = 6.0\nup = "z"\nbody = "humanoid_hands"\nframes = [0, {amount(_GESTURES, 12)}]\n'
+    text += f'[calibration]\nfile = "{videos / "config.toml"}"\n'
+    for k in range(4):
+        text += f'[[camera]]\nname = "cam_{k}"\nvideo = "{videos / f"port_{k}.mp4"}"\n'
+    found = seen_of(text, detect=True)
     assert found.rig is not None
     return found.rig, {k.camera: k for k in found.keypoints}
 

@@ -8,25 +8,26 @@ seconds no camera sees the left hand. Settings were chosen on seeds 0 to 3; prin
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.commands import ended
 from benchmarks.figures import FAILED, amount, figure
+from benchmarks.scenes.simulated import rows_of, without
+from benchmarks.scenes.simulated import somebody as with_other_lengths
+from benchmarks.timing import fastest
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, read_motion, track
 from kinefit.bodies import Body
 from kinefit.geometry import se3
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.simulation.evaluation import angle_errors, joint_errors
+from kinefit.simulation.figures import look_at
 from kinefit.simulation.retarget import known_motion
-from kinefit.solving.bundle.shape import mirror_points
 
 SET = "MEDIAPIPE_75"
 FINGERS = ("thumb", "index", "middle", "ring", "little")
@@ -79,14 +80,8 @@ def hands_moving(seed: int, *, seconds: float = _SECONDS) -> Motion:
 
 def somebody(truth: Motion, seed: int, keypoint_set: str = SET) -> Motion:
     """The motion of somebody else, whose detector's points stand elsewhere."""
-    random = np.random.default_rng(seed)
-    body = truth.body.scaled(random.normal(1.0, 0.05, len(truth.body.scale_groups)))
-    points = body.keypoints(keypoint_set)
-    lead, sign = mirror_points(points, body.tree.segments)
-    shift = np.where(fingers(body)[0][points.segments, None], 0.002, 0.008) * random.normal(size=(len(points), 3))
-    shift = shift[lead]
-    shift[:, 2] *= sign
-    return replace(truth, body=body.with_keypoints(keypoint_set, points.points + shift))
+    std = np.where(fingers(truth.body)[0][truth.body.keypoints(keypoint_set).segments, None], 0.002, 0.008)
+    return with_other_lengths(truth, keypoint_set, np.random.default_rng(seed), std)
 
 
 def near_rig(truth: Motion, landmarks: tuple[str, ...] = ("l_wrist", "r_wrist")) -> Rig:
@@ -96,11 +91,9 @@ def near_rig(truth: Motion, landmarks: tuple[str, ...] = ("l_wrist", "r_wrist"))
     cameras = []
     for k, (camera, azimuth) in enumerate(zip(rig, np.radians((-55.0, -18.0, 20.0, 60.0)))):
         place = middle + 1.5 * np.array([np.cos(azimuth), 0.25 + 0.2 * (k % 2), np.sin(azimuth)])
-        z = (middle - place) / np.linalg.norm(middle - place)
-        x = np.cross(z, [0.0, 1.0, 0.0]) / np.linalg.norm(np.cross(z, [0.0, 1.0, 0.0]))
-        R = np.stack([x, np.cross(z, x), z])
+        T_camera_world = look_at(place, middle, np.array([0.0, 1.0, 0.0]))
         matrix = np.array([[1000.0, 0, 639.5], [0, 1000.0, 479.5], [0, 0, 1]])
-        cameras.append(replace(camera, matrix=matrix, T_camera_world=se3.transform(R, -R @ place)))
+        cameras.append(replace(camera, matrix=matrix, T_camera_world=T_camera_world))
     return Rig(tuple(cameras))
 
 
@@ -111,14 +104,14 @@ def seen_by(truth: Motion, rig: Rig, seed: int) -> list[Keypoints]:
     )
     random, out = np.random.default_rng(seed), []
     for record in seen:
-        points, confidence = np.array(record.points), np.array(record.confidence)
+        count = len(record)
         for side, first in (("left", 33), ("right", 54)):
-            hand, start = slice(first, first + 21), random.integers(0, round(0.6 * len(points)))
-            gone = np.arange(len(points)) // round(0.2 * len(points)) == start // round(0.2 * len(points))
+            start = random.integers(0, round(0.6 * count))
+            gone = np.arange(count) // round(0.2 * count) == start // round(0.2 * count)
             if side == "left":
-                gone |= np.arange(len(points)) >= len(points) - round(_HIDDEN * truth.rate)
-            points[gone, :, hand], confidence[gone, :, hand] = np.nan, 0.0
-        out.append(replace(record, points=points, confidence=confidence))
+                gone |= np.arange(count) >= count - round(_HIDDEN * truth.rate)
+            record = without(record, gone, slice(first, first + 21))
+        out.append(record)
     return out
 
 
@@ -129,12 +122,10 @@ def tracked(rig: Rig, seen: list[Keypoints], folder: Path, body: str = "humanoid
     lines += ['[calibration]\nfile = "calibration.toml"\n']
     lines += [f'[[camera]]\nname = "{name}"\n' for name in dict.fromkeys(one.camera for one in seen)]
     for one in seen:
-        values = np.concatenate([one.points[:, 0], one.confidence[:, 0, :, None]], axis=-1)
-        np.save(folder / (file := f"{one.camera}_{one.keypoint_set}.npy"), np.nan_to_num(values))
+        np.save(folder / (file := f"{one.camera}_{one.keypoint_set}.npy"), rows_of(one))
         lines += [f'[[keypoints]]\ncamera = "{one.camera}"\nfile = "{file}"\nformat = "mediapipe"\n']
     (folder / "take.toml").write_text("\n".join(lines))
-    command = [sys.executable, "-m", "kinefit", "track", str(folder / "take.toml"), "-o", str(folder / "out")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    done = ended("track", folder / "take.toml", "-o", folder / "out", timeout=600)
     if done.returncode:
         FAILED.append(f"track {body}")
         raise RuntimeError(done.stderr[-2000:])
@@ -195,9 +186,5 @@ def run() -> None:
 
 def _speed(rig: Rig, seen: list[Keypoints], name: str) -> float:
     """Frames a second of processor time, size of the person and smoothing included: the better of two."""
-    recording, spent = Recording.of_keypoints(rig, seen, up="y"), []
-    for _ in range(amount(2, 1)):
-        began = time.process_time()
-        track(recording, load_body(name))
-        spent.append(time.process_time() - began)
-    return len(seen[0].points) / min(spent)
+    recording = Recording.of_keypoints(rig, seen, up="y")
+    return len(seen[0].points) / fastest(lambda: track(recording, load_body(name)), amount(2, 1))[1]

@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy.hands.hands_simulated import near_rig, somebody, tracked
 from benchmarks.figures import amount, figure
+from benchmarks.scenes.simulated import with_points_off
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, track
 from kinefit.geometry import se3
 from kinefit.sensors.points.lifted import HIPS
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.simulation.evaluation import angle_errors
+from kinefit.simulation.keypoints import drift
 from kinefit.simulation.retarget import known_motion
-from kinefit.solving.bundle.shape import mirror_points
 
 POSE, FACE = "MEDIAPIPE_33", "MEDIAPIPE_478"
 ERRORS = {"noise_px": 2.0, "drift_px": 1.0, "drift_time": 0.3, "outliers": 0.03, "missing": 0.05}
@@ -68,10 +69,7 @@ def with_own_face(truth: Motion, seed: int) -> Motion:
     eye = np.array([segments[s].startswith("eye") for s in points.segments])[:, None]
     shift = np.where(eye, 0.0005, 0.002) * random.normal(size=(len(points), 3))
     shift = shift + np.where(eye, 0.0015, 0.0) * random.normal(size=3)
-    lead, sign = mirror_points(points, segments)
-    shift = shift[lead]
-    shift[:, 2] *= sign
-    return replace(truth, body=truth.body.with_keypoints(FACE, points.points + shift))
+    return replace(truth, body=with_points_off(truth.body, FACE, shift))
 
 
 def _with_depth(truth: Motion, rig: Rig, record: Keypoints, seed: int) -> Keypoints:
@@ -81,10 +79,8 @@ def _with_depth(truth: Motion, rig: Rig, record: Keypoints, seed: int) -> Keypoi
     x = truth.positions(points)[:, order]
     hips = x[:, [record.names.index(name) for name in HIPS]].mean(axis=1, keepdims=True)
     lifted = 0.95 * (x - hips) @ rig.cameras[0].T_camera_world[:3, :3].T
-    keep, drift = np.exp(-1.0 / (0.5 * _RATE)), random.standard_normal((len(x), len(truth.body.tree.segments)))
-    for f in range(1, len(drift)):
-        drift[f] = keep * drift[f - 1] + np.sqrt(1.0 - keep**2) * drift[f]
-    lifted[..., 2] += 0.05 * drift[:, points.segments[order]] + 0.02 * random.normal(size=lifted.shape[:2])
+    shared = drift((len(x), len(truth.body.tree.segments)), np.exp(-1.0 / (0.5 * _RATE)), random)
+    lifted[..., 2] += 0.05 * shared[:, points.segments[order]] + 0.02 * random.normal(size=lifted.shape[:2])
     lifted[np.isnan(record.points[:, 0]).any(axis=-1)] = np.nan
     return replace(record, lifted=lifted[:, None])
 

@@ -17,7 +17,8 @@ from benchmarks.accuracy.images.silhouettes_track import overlaps
 from benchmarks.accuracy.images.silhouettes_track import take_text as masks_text
 from benchmarks.accuracy.mixed import mixed_real
 from benchmarks.figures import LEFT_OUT, NotMeasured, amount, figure, quick, recording
-from benchmarks.scenes.balancing import CAMERAS, seen_of, tracked, trial_text
+from benchmarks.scenes.balancing import CAMERAS, trial_text
+from benchmarks.scenes.takes import seen_of, tracked
 from kinefit.bodies import BodyState
 from kinefit.bodies.motion import UP_AXES, Motion
 from kinefit.bodies.rendering import render_body, scaled

@@ -9,11 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.images.silhouettes_track import FRAMES, SCALE, take_text
+from benchmarks.accuracy.images.silhouettes_track import FRAMES, SCALE, overlap, take_text
 from benchmarks.figures import ROOT, amount, figure, recording
 from benchmarks.papers.silhouettes.silhouettes_cga import least_ms
-from benchmarks.scenes.balancing import CAMERAS, tracked
+from benchmarks.scenes.balancing import CAMERAS
+from benchmarks.scenes.regions_scene import face_normals
 from benchmarks.scenes.silhouettes_scene import shape_from_silhouettes
+from benchmarks.scenes.takes import tracked
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.morphs.anny import AnnyModel, load_anny
 from kinefit.bodies.morphs.morphing import Morphing
@@ -89,8 +91,7 @@ def overlaps(
         canvas = Canvas(camera.size)
         for i, state in enumerate(states):
             seen = canvas.draw_for(camera, model.pose(state).vertices, model.mesh.faces, cull=True).seen
-            mask = cv2.resize(video.frame(i).mask, camera.size, interpolation=cv2.INTER_AREA) > 127
-            out[i, c] = (seen & mask).sum() / max((seen | mask).sum(), 1)
+            out[i, c] = overlap(seen, video.frame(i).mask)
     return out
 
 
@@ -99,10 +100,8 @@ def shaded(
 ) -> NDArray:
     """The picture (H, W, 3) with the skin on it."""
     x, faces = model.pose(state).vertices, model.mesh.faces
-    corners = x[faces]
-    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-15)
-    light = np.clip(n @ (camera.T_camera_world[:3, :3].T @ np.array([-0.4, -0.5, -0.77])), 0.0, 1.0)
+    lamp = camera.T_camera_world[:3, :3].T @ np.array([-0.4, -0.5, -0.77])
+    light = np.clip(face_normals(x, faces) @ lamp, 0.0, 1.0)
     face = Canvas(camera.size).draw_for(camera, x, faces, cull=True).face
     body = (0.25 + 0.75 * light)[face][..., None] * np.array(colour)
     return np.where((face >= 0)[..., None], 0.25 * picture + 0.75 * body, picture).astype(np.uint8)

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import LEFT_OUT, NotMeasured, amount, figure, quick, recording
-from benchmarks.scenes.balancing import CAMERAS, masks_of, tracked, trial_text
+from benchmarks.scenes.balancing import CAMERAS, masks_of, trial_text
+from benchmarks.scenes.takes import tracked
 from kinefit.bodies import BodyState
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.rendering import render_body, scaled
@@ -38,9 +39,14 @@ def overlaps(motion: Motion, rig: Rig, masks: Sequence[SilhouetteVideo]) -> NDAr
         for c, video in enumerate(masks):
             camera = scaled(rig[video.sensor], SCALE)
             seen = render_body(motion.body, state, camera, mesh=mesh).seen
-            mask = cv2.resize(video.frame(i).mask, camera.size, interpolation=cv2.INTER_AREA) > 127
-            out[i, c] = (seen & mask).sum() / max((seen | mask).sum(), 1)
+            out[i, c] = overlap(seen, video.frame(i).mask)
     return out
+
+
+def overlap(seen: NDArray, mask: NDArray) -> float:
+    """Intersection over union of an image (h, w) bool and a mask (H, W), 255 on the body, at the image's size."""
+    own = cv2.resize(mask, seen.shape[::-1], interpolation=cv2.INTER_AREA) > 127
+    return float((seen & own).sum() / max((seen | own).sum(), 1))
 
 
 def run() -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.figures import NotMeasured, amount, data, each, figure
 from benchmarks.scenes.marker_takes import put_right
+from benchmarks.timing import timed, took
 from kinefit.bodies.marker_sets import find_marker_set
 from kinefit.markers.audit.audit import audit_take
 from kinefit.markers.model.learn import learn_model, training_gate
@@ -114,9 +115,8 @@ def run() -> None:
         if markers is None:
             continue
         takes += 1
-        start = time.process_time()
-        before = audit_take(markers)
-        seconds.append(time.process_time() - start)
+        with timed(seconds):
+            before = audit_take(markers)
         alarms += sum(f.kind in ("swapped", "throughout") for f in before)
         for wrong, pair, first, last in injected(markers, learn_model(markers), rng):
             found = [f for f in audit_take(wrong) if f.kind in ("swapped", "throughout")]
@@ -151,6 +151,20 @@ def run() -> None:
     calibration()
 
 
+def two_near(x: NDArray, rng: np.random.Generator) -> tuple[int, int, int]:
+    """A frame of a take (F, M, 3) and two labels that are seen about it, one of the six nearest to the other."""
+    f = int(rng.integers(5, len(x) - 5))
+    seen = np.flatnonzero(np.isfinite(x[f - 2 : f + 3, :, 0]).all(0))
+    a = int(rng.choice(seen))
+    return f, a, int(seen[rng.choice(np.argsort(np.linalg.norm(x[f, seen] - x[f, a], axis=-1))[1:7])])
+
+
+def is_named(wrong: Markers, f: int, a: int, b: int) -> bool:
+    """Whether the audit names two exchanged columns, to two frames."""
+    pair = {wrong.names[a], wrong.names[b]}
+    return any({*g.labels} == pair and abs(g.first - f) + abs(g.last - f) <= 2 for g in audit_take(wrong))
+
+
 def one_frame() -> None:
     """Two labels exchanged for one frame, near each other, with both seen or one hidden: four of each in every take."""
     rng = np.random.default_rng(3)
@@ -162,15 +176,10 @@ def one_frame() -> None:
         column = [markers.names.index(n) for n in learn_model(markers).labels]
         x = markers.positions[:, column]
         for hidden in (False, True) * amount(4, 1):
-            f = int(rng.integers(5, len(markers) - 5))
-            seen = np.flatnonzero(np.isfinite(x[f - 2 : f + 3, :, 0]).all(0))
-            a = int(rng.choice(seen))
-            b = int(seen[rng.choice(np.argsort(np.linalg.norm(x[f, seen] - x[f, a], axis=-1))[1:7])])
+            f, a, b = two_near(x, rng)
             positions = np.array(markers.positions)
             positions[f, column[a]], positions[f, column[b]] = x[f, b], x[f, a] if not hidden else np.nan
-            found = audit_take(replace(markers, positions=positions, residual=None))
-            pair = {markers.names[column[a]], markers.names[column[b]]}
-            hits += any(set(g.labels) == pair and abs(g.first - f) + abs(g.last - f) <= 2 for g in found)
+            hits += is_named(replace(markers, positions=positions, residual=None), f, column[a], column[b])
             tried += 1
     why = "" if tried else "no recordings: set KINEFIT_DATA"
     figure("audit_one_frame_exchanges", 100 * hits / tried if tried else None, "% found", ">= 98", why)
@@ -196,10 +205,7 @@ def in_gaps() -> None:
         column = [markers.names.index(n) for n in learn_model(markers).labels]
         x = markers.positions[:, column]
         for way, (_, a_before, b_around, a_after, hidden) in [*enumerate(ways)] * amount(2, 1):
-            f = int(rng.integers(5, len(markers) - 5))
-            seen = np.flatnonzero(np.isfinite(x[f - 2 : f + 3, :, 0]).all(0))
-            a = int(rng.choice(seen))
-            b = int(seen[rng.choice(np.argsort(np.linalg.norm(x[f, seen] - x[f, a], axis=-1))[1:7])])
+            f, a, b = two_near(x, rng)
             low, high = f - rng.integers(1, 31, 2).clip(max=f), f + rng.integers(1, 31, 2)
             y = np.array(x)
             for k, first, last in ((a, low[0] if a_before else f, high[0] if a_after else f), (b, low[1], high[1])):
@@ -208,9 +214,7 @@ def in_gaps() -> None:
             y[f, a], y[f, b] = x[f, b], np.nan if hidden else x[f, a]
             positions = np.array(markers.positions)
             positions[:, column] = y
-            found = audit_take(replace(markers, positions=positions))
-            pair = {markers.names[column[a]], markers.names[column[b]]}
-            hits[way] += any(set(g.labels) == pair and abs(g.first - f) + abs(g.last - f) <= 2 for g in found)
+            hits[way] += is_named(replace(markers, positions=positions), f, column[a], column[b])
         tried += amount(2, 1)
     for (what, *_), count in zip(ways, hits):
         print(f"# exchanges in gaps, {what}: {count} of {tried}")
@@ -233,9 +237,8 @@ def gappy() -> None:
         (a, b), f = rng.choice(x.shape[1], 2, replace=False), int(rng.integers(len(x) - 200))
         n = int(rng.integers(5, 200))
         x[f : f + n, [a, b]] = x[f : f + n, [b, a]]
-    start = time.process_time()
-    found = audit_take(replace(markers, positions=x, residual=None))
-    figure("audit_seconds_gaps_and_swaps", time.process_time() - start, "s CPU", "<= 5")
+    found, seconds = took(lambda: audit_take(replace(markers, positions=x, residual=None)))
+    figure("audit_seconds_gaps_and_swaps", seconds, "s CPU", "<= 5")
     print(f"# {sum(f.kind == 'swapped' for f in found)} exchanges reported of 15 injected into gaps")
 
 

@@ -14,9 +14,9 @@ os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL
 
 import json
 import tempfile
-import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import LEFT_OUT, amount, each, figure, peers, quick, recording
 from benchmarks.peers import read_mot
 from benchmarks.peers.environments import run_peer
+from benchmarks.timing import fastest, took
 from kinefit import Markers, Motion, load_body, read_markers
 from kinefit.cli.markers._fit import worn_body
 from kinefit.exporters import write_markers, write_osim
@@ -114,7 +115,9 @@ def opensim() -> None:
     print(f"# bmc run: sagittal angles, RMS difference [deg], each with its own zero: {told(values)}")
     joints = {f"{j}_{s}": f"{n}_{s}" for j, n in OPENSIM.items() for s in "rl"}
     x = columns(trials[1], subject.points.names)
-    seconds = fastest(lambda: sequence_both_ways(subject.body, subject.points, x, subject.sigma))  # as OpenSim: no bars
+    fit = partial(sequence_both_ways, subject.body, subject.points, x, subject.sigma)  # as OpenSim: no bars
+    fit()  # compiled
+    seconds = fastest(fit, REPEATS)[1]
     with tempfile.TemporaryDirectory() as name:
         own = Path(name)
         write_osim(worn_body(subject, trials[1].names), own / "body.osim")
@@ -218,9 +221,8 @@ def long_take() -> None:
     x = np.concatenate([take.positions, take.positions[::-1]])[: amount(7200, 400)]
     markers = replace(take, positions=x, residual=None)
     fitted([replace(markers, positions=x[:200])])  # compiled
-    start = time.process_time()  # one core; the clock on the wall says the same on a machine that does nothing else
-    _, motion = fitted([markers])
-    seconds = time.process_time() - start
+    # one core; the clock on the wall says the same on a machine that does nothing else
+    (_, motion), seconds = took(lambda: fitted([markers]))
     inlier = motion.residuals["markers"].weights > 0.5
     print(f"# break dance: {len(motion)} frames, {100 * inlier.mean():.1f} % of markers fit, RMS "
           f"{1e3 * rms(motion.residuals['markers'].norms[inlier]):.1f} mm")
@@ -303,14 +305,3 @@ def rms(values: NDArray) -> float:
 def told(values: dict[str, float], digits: int = 1) -> str:
     """Values by name and their mean."""
     return ", ".join(f"{k} {v:.{digits}f}" for k, v in values.items()) + f"; mean {np.mean(list(values.values())):.1f}"
-
-
-def fastest(work: Any) -> float:
-    """Seconds of the processor of the fastest of some runs on one core, after one that compiles."""
-    work()
-    times = []
-    for _ in range(REPEATS):
-        start = time.process_time()
-        work()
-        times.append(time.process_time() - start)
-    return min(times)

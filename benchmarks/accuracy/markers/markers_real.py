@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
-from benchmarks.scenes.marker_takes import CASES, HELD, Case, broken, load, shuffled, training
+from benchmarks.scenes.marker_takes import CASES, HELD, Case, broken, counts, load, shares, shuffled, training
+from benchmarks.timing import timed
 from kinefit.errors import ObservationError
 from kinefit.markers.frame.identify import identify
 from kinefit.markers.model.learn import learn_model
@@ -58,27 +59,23 @@ def single_frames(
 ) -> Score:
     """Frames one by one, spread over the take."""
     rng = np.random.default_rng(seed)
-    right = wrong = seen = 0
-    times, names = [], []
+    counted, times, names = np.zeros(3, int), [], []
     whole = np.flatnonzero(np.isfinite(take.positions[..., 0]).sum(1) >= 0.5 * take.positions.shape[1])
     for f in whole[np.unique(np.linspace(0, len(whole) - 1, frames).round().astype(int))]:
         points, truth = shuffled(take, model.labels, int(f), rng, missing, ghosts)
-        start = time.process_time()
-        told = identify(model, points)
-        times.append(time.process_time() - start)
+        with timed(times):
+            told = identify(model, points)
         found, guess = told.assignment, told.assignment if told.guess is None else told.guess
         held = [max(int((guess[list(s)] >= 0).sum()) for s in model.segments if m in s) for m in range(len(model))]
         names.append(np.stack([told.confidence, guess == truth, held], axis=1)[guess >= 0])
-        right += int(((found == truth) & (truth >= 0)).sum())
-        wrong += int(((found != truth) & (found >= 0)).sum())
-        seen += int((truth >= 0).sum())
+        counted += counts(found, truth)
+    right, wrong, seen = counted.tolist()
     return Score(right / seen, wrong / seen, float(np.median(times)), float(np.max(times)), np.concatenate(names))
 
 
 def whole_take(model: MarkerModel, take: Markers, seed: int = 0, **breaking: float) -> Score:
     """A take whose trajectories are broken; its time is that of one frame."""
     cut = broken(take, seed, **breaking)
-    column = np.array([take.names.index(n) if n in take.names else -9 for n in model.labels])
     start = time.process_time()
     try:
         found = identify_take(model, cut.markers)
@@ -86,10 +83,7 @@ def whole_take(model: MarkerModel, take: Markers, seed: int = 0, **breaking: flo
         print(f"refused after {time.process_time() - start:.1f} s: {error.problem}")
         return Score(np.nan, np.nan)
     spent = (time.process_time() - start) / len(take)
-    named = np.where(found.column >= 0, cut.truth[np.arange(len(take))[:, None], found.column], -2)
-    seen = (cut.truth[:, :, None] == column).any(1)
-    right, wrong = (named == column) & seen, (found.column >= 0) & (named != column)
-    return Score(float(right.sum() / seen.sum()), float(wrong.sum() / seen.sum()), spent, spent)
+    return Score(*shares(found.column, cut, take, model.labels), spent, spent)
 
 
 def table(names: list[str]) -> dict[str, tuple[Case, dict[str, Score]]]:

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from click.testing import CliRunner
 from numpy.typing import NDArray
 
+from benchmarks.commands import printed
 from benchmarks.figures import amount, figure
+from benchmarks.scenes.marker_takes import counts
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.exporters import write_markers
 from kinefit.markers.frame.identify import identify
@@ -56,9 +57,9 @@ class Robot:
         return self.body.markers("ROBOT").names
 
 
-def make_robot(folder: Path, seed: int = 0) -> Robot:
+def make_robot(folder: Path) -> Robot:
     """Body file and marker set of a six-axis arm with 30 markers."""
-    rng, body, rows, places = np.random.default_rng(seed), ['[body]\nname = "six_axis"'], [], {}
+    rng, body, rows, places = np.random.default_rng(0), ['[body]\nname = "six_axis"'], [], {}
     placed, at_rest = [], np.zeros(3)
     for k, (name, joint, axis, end, radius, count) in enumerate(LINKS):
         at_rest = at_rest + joint
@@ -107,7 +108,7 @@ def learn(robot: Robot, folder: Path, seed: int) -> Path:
     rng = np.random.default_rng([seed, 1])
     angles = smooth_angles(robot, 3, rng)
     write_markers(Markers(robot.labels, RATE, positions(robot, angles, rng), up="y"), folder / "labelled.c3d")
-    command("markers", "learn", folder / "labelled.c3d", "--frame", 0, "--set", robot.set_file, "--name", "robot",
+    printed("markers", "learn", folder / "labelled.c3d", "--frame", 0, "--set", robot.set_file, "--name", "robot",
             "-o", folder / "robot.json")  # fmt: skip
     return folder / "robot.json"
 
@@ -115,7 +116,7 @@ def learn(robot: Robot, folder: Path, seed: int) -> Path:
 def single_frames(robot: Robot, model_file: Path, poses: int, seed: int) -> tuple[float, float, float]:
     """Shares [%] of seen markers that get their own name, of names that are wrong, and of poses without a mistake."""
     model, rng = load_model(model_file), np.random.default_rng([seed, 2])
-    tree, right, wrong, seen, whole = robot.body.tree, 0, 0, 0, 0
+    tree, counted, whole = robot.body.tree, np.zeros(3, int), 0
     order = [model.labels.index(label) for label in robot.labels]
     for _ in range(poses):
         x = positions(robot, rng.uniform(tree.lower, tree.upper)[None], rng)[0]
@@ -125,10 +126,9 @@ def single_frames(robot: Robot, model_file: Path, poses: int, seed: int) -> tupl
         truth = np.full(len(x), -1)
         truth[there] = np.argsort(shuffled)[: there.sum()]
         found = identify(model, points[shuffled]).assignment[order]
-        right += int(((found == truth) & there).sum())
-        wrong += int(((found >= 0) & (found != truth)).sum())
-        seen += int(there.sum())
+        counted += counts(found, truth)
         whole += bool((found == truth).all())
+    right, wrong, seen = counted.tolist()
     return 100 * right / seen, 100 * wrong / max(right + wrong, 1), 100 * whole / poses
 
 
@@ -155,20 +155,10 @@ def broken_take(robot: Robot, folder: Path, frames: int, seed: int) -> tuple[NDA
     return angles, x, seen
 
 
-def command(*words: object) -> str:
-    """A command of kinefit; what it said."""
-    from kinefit.cli import main
-
-    told = CliRunner().invoke(main, [str(word) for word in words])
-    if told.exit_code:
-        raise RuntimeError(told.output)
-    return told.output
-
-
 def whole_take(robot: Robot, model: Path, folder: Path, frames: int, seed: int) -> dict[str, float]:
     """Shares [%] named and wrong of a take by `identify`; by `track`, errors of angles [deg] and of the tool [mm]."""
     angles, x, seen = broken_take(robot, folder, frames, seed)
-    command("markers", "identify", folder / "points.c3d", model, "--no-fill")
+    printed("markers", "identify", folder / "points.c3d", model, "--no-fill")
     named = read_markers(folder / "points-named.c3d")
     found = named.positions[:, [named.names.index(label) for label in robot.labels]]
     there = np.isfinite(found).all(axis=2)
@@ -177,7 +167,7 @@ def whole_take(robot: Robot, model: Path, folder: Path, frames: int, seed: int) 
         '[take]\nbody = "robot.toml"\nup = "y"\nsize = false\n[[markers]]\nfile = "points.c3d"\nset = "ROBOT"\n'
         'model = "robot.json"\nsigma = 0.001\n'
     )
-    command("track", folder / "take.toml", "-o", folder / "result", "--formats", "motion")
+    printed("track", folder / "take.toml", "-o", folder / "result", "--formats", "motion")
     motion = read_motion(folder / "result" / "motion.npz")
     off = np.degrees(motion.angles - angles[: len(motion)])
     tool = robot.body.tree.segment("tool")

@@ -16,10 +16,8 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
-
 from benchmarks.figures import amount, figure
-from benchmarks.scenes.marker_takes import HELD, broken, load
+from benchmarks.scenes.marker_takes import HELD, broken, load, shares
 from kinefit import load_body
 from kinefit.errors import ObservationError
 from kinefit.fitting.markers.first_set import first_set
@@ -51,11 +49,8 @@ def named(taught: Markers, asked: Markers, template: str) -> tuple[float, float,
     except ObservationError as error:
         return 0.0, 0.0, time.process_time() - start, error.problem
     spent = time.process_time() - start
-    column = np.array([asked.names.index(n) if n in asked.names else -9 for n in model.labels])
-    truth = np.where(found.column >= 0, cut.truth[np.arange(len(asked))[:, None], found.column], -2)
-    seen = (cut.truth[:, :, None] == column).any(1)
-    right, wrong = (truth == column) & seen, (found.column >= 0) & (truth != column)
-    return 100 * float(right.sum() / seen.sum()), 100 * float(wrong.sum() / seen.sum()), spent, ""
+    right, wrong = shares(found.column, cut, asked, model.labels)
+    return 100 * right, 100 * wrong, spent, ""
 
 
 def run() -> None:

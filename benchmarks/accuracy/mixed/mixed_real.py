@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy.images.silhouettes_track import overlaps
 from benchmarks.figures import NotMeasured, data, figure
-from benchmarks.scenes.balancing import CAMERAS, TRIAL, masks_of, tracked, trial_text
+from benchmarks.scenes.balancing import CAMERAS, TRIAL, masks_of, trial_text
+from benchmarks.scenes.takes import tracked
 from kinefit import Keypoints, Motion, Rig
 from kinefit.errors import KinefitError
 from kinefit.fitting.multiview.association import choose_people

@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import data
 from benchmarks.scenes.motions import MOTIONS
+from benchmarks.scenes.simulated import calibrated, rows_of, with_points_off
 from kinefit import Motion, load_body
 from kinefit.bodies import Body
 from kinefit.bodies.morphs.anny import AnnyModel, load_anny
 from kinefit.bodies.rendering import scaled
 from kinefit.exporters.c3d_file import write_markers
-from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import DepthVideo, Markers
 from kinefit.readers import read_amc, read_bvh
@@ -46,12 +46,10 @@ from kinefit.simulation import (
     studio_rig,
 )
 from kinefit.simulation.rendering.scenes import room
-from kinefit.solving.bundle.shape import mirror_points
 
 RATE, SECONDS, TRAVEL = 30.0, 3.0, 1.5  # [Hz], [s], [m]
 DETECTOR, MARKER_SET, CAMERAS = "MEDIAPIPE_33", "HANIM_45", ("cam01", "cam02", "cam03", "cam04")
 MASK_SCALE = 0.25
-CALIBRATION = (np.radians(0.1), 0.003)  # [rad, m] one standard deviation about and along each axis
 SENSOR = DepthSensor("depth", (160, 120), 137.0, 0.5, 5.5, (0.004, 0.0008, 0.0), oblique=0.5, samples=3, holes=0.01)
 WRISTS_ANKLES = ("l_ulnar_styloid", "r_ulnar_styloid", "l_lateral_malleolus", "r_lateral_malleolus")
 TWENTY = (
@@ -101,16 +99,12 @@ def person(random: np.random.Generator) -> Body:
     stature = float(np.clip(random.normal(1.77 - 0.13 * gender, 0.07), 1.55, 1.95))
     model = _model()
     anny = model.body(model.of_stature(stature, gender=gender, weight=share(), muscle=share(), proportions=share()))
-    return with_own_keypoints(_with_skin_of(anny, random.normal(1.0, 0.02, len(anny.scale_groups))), random)
+    return with_own_points(_with_skin_of(anny, random.normal(1.0, 0.02, len(anny.scale_groups))), random)
 
 
-def with_own_keypoints(body: Body, random: np.random.Generator) -> Body:
+def with_own_points(body: Body, random: np.random.Generator) -> Body:
     """A body whose detector points stand 8 mm from their places, left as right."""
-    points = body.keypoints(DETECTOR)
-    lead, sign = mirror_points(points, body.tree.segments)
-    shift = random.normal(0.0, 0.008, (len(points), 3))[lead]
-    shift[:, 2] *= sign
-    return body.with_keypoints(DETECTOR, points.points + shift)
+    return with_points_off(body, DETECTOR, random.normal(0.0, 0.008, (len(body.keypoints(DETECTOR)), 3)))
 
 
 def _with_skin_of(anny: Body, off: NDArray) -> Body:
@@ -171,19 +165,25 @@ def record(draw: int, frames: int = round(RATE * SECONDS), *, depth: bool = True
     rig = studio_rig(truth)
     front = in_front(truth, SENSOR.camera(), azimuth=float(random.uniform(-0.6, 0.6)), near=SENSOR.near, far=SENSOR.far)
     both = Rig((*rig, front))
-    told = Rig(tuple(camera.with_pose(camera_error(random) @ camera.T_camera_world) for camera in both))
+    told = calibrated(both, random)
     bare = SimulatedScene(truth, truth.body.skin)  # type: ignore[arg-type]
     masks = np.array([[_mask(bare, i, camera, random) for i in range(len(truth))] for camera in rig])
     if not depth:
         none = np.zeros((0, *SENSOR.size[::-1]), np.uint16)
         return Recording(truth, both, told, detected(truth, both, draw), masks, none, none, marked(truth, random))
+    images = depth_images(bare, front, draw)
+    return Recording(truth, both, told, detected(truth, both, draw), masks, *images, marked(truth, random))
+
+
+def depth_images(bare: SimulatedScene, front: Camera, draw: int) -> tuple[NDArray, NDArray]:
+    """(F, H, W), (10, H, W) [mm] uint16 what the depth camera sees of a scene in a room, and of the empty room."""
+    truth = bare.motion
     around = replace(bare, room=room(truth, front))
     video = _counts(simulate_depth(truth, front, SENSOR, seed=draw, scene=around), len(truth))
     T = np.array(truth.Ts_world_root)
     T[:, 1, 3] -= AWAY
     gone = replace(around, motion=replace(truth, Ts_world_root=T))
-    empty = _counts(simulate_depth(gone.motion, front, SENSOR, seed=draw + 10_000, scene=gone), EMPTY)
-    return Recording(truth, both, told, detected(truth, both, draw), masks, video, empty, marked(truth, random))
+    return video, _counts(simulate_depth(gone.motion, front, SENSOR, seed=draw + 10_000, scene=gone), EMPTY)
 
 
 def detected(
@@ -192,8 +192,7 @@ def detected(
     """(C, F, 33, 3) points and visibility, as MediaPipe gives them."""
     chosen = Rig(tuple(rig[name] for name in cameras))
     seen = simulate_keypoints(truth, chosen, DETECTOR, drift_px=2.0, outliers=outliers, seed=draw)
-    arrays = [np.concatenate([k.points[:, 0], k.confidence[:, 0, :, None]], axis=-1) for k in seen]
-    return np.nan_to_num(np.array(arrays)).astype(np.float32)
+    return np.array([rows_of(k) for k in seen]).astype(np.float32)
 
 
 def write(recording: Recording, folder: Path) -> None:
@@ -240,12 +239,6 @@ def take_text(folder: Path, parts: Sequence[str]) -> str:
         if part.startswith("markers "):
             text += f'[[markers]]\nfile = "{folder}/markers_{part.removeprefix("markers ")}.trc"\n'
     return text
-
-
-def camera_error(random: np.random.Generator, times: float = 1.0) -> NDArray:
-    """(4, 4) a small error of a camera's pose, so many times as large as calibrations usually have."""
-    turn, shift = times * np.array(CALIBRATION)
-    return se3.transform(se3.exp_so3(random.normal(0.0, turn, 3)), random.normal(0.0, shift, 3))
 
 
 def _counts(video: DepthVideo, count: int) -> NDArray:

@@ -16,6 +16,7 @@ from pathlib import Path
 from benchmarks.accuracy.video.tracking import read_trial
 from benchmarks.figures import LEFT_OUT, data, figure, quick
 from benchmarks.scenes.held_out import cameras_left_out, median, persons, sides_right
+from benchmarks.scenes.takes import seen_of
 from kinefit import (
     Keypoints,
     Motion,
@@ -23,9 +24,7 @@ from kinefit import (
     Rig,
     TrackSettings,
     load_body,
-    load_observations,
     read_calibration,
-    read_take,
     track,
 )
 from kinefit.errors import AssetError, ObservationError
@@ -35,7 +34,6 @@ from kinefit.fitting.tracking.sizing import channels_of
 from kinefit.observations import MEDIAPIPE_33
 from kinefit.readers.landmarks.keypoints import read_caliscope_csv
 from kinefit.sensors.points.views import ViewBias
-from kinefit.takes.missing import prepared
 from kinefit.takes.preparing import detecting
 
 _OWN, _TABLE = "x that without, bias found in the take", "x that without, bias of the other two recordings"
@@ -117,10 +115,10 @@ def _takes(where: Path) -> dict[str, Seen]:
             read = read_trial(trial, detector, where)
             out[detector] = Seen(read.rig, persons(read.rig, read.keypoints))
         videos = {f"cam0{c}": f"{trial}/videos/cam0{c}.mp4" for c in range(1, 5)}
-        out["balancing"] = _detected(where / "balancing", f"{trial}/Calib_refined_static.toml", videos, 60.0, boxed=2)
+        out["balancing"] = _detected(f"{trial}/Calib_refined_static.toml", videos, 60.0, boxed=2)
     if seated is not None:
         videos = {f"cam_{c}": f"{seated}/port_{c}.mp4" for c in range(4)}
-        out["seated"] = _detected(where / "seated", f"{seated}/config.toml", videos, 6.0)
+        out["seated"] = _detected(f"{seated}/config.toml", videos, 6.0)
     if cropped is not None:
         rig = read_calibration(cropped / "config.toml")
         ports = read_caliscope_csv(cropped / "HOLISTIC" / "xy_HOLISTIC.csv", rate=24.0)
@@ -130,14 +128,12 @@ def _takes(where: Path) -> dict[str, Seen]:
     return out
 
 
-def _detected(folder: Path, calibration: str, videos: dict[str, str], rate: float, boxed: int = 0) -> Seen:
+def _detected(calibration: str, videos: dict[str, str], rate: float, boxed: int = 0) -> Seen:
     """By the built-in detector; the first so many videos are letterboxed."""
     detecting.networks(None, print)
-    folder.mkdir()
     text = f'[take]\nrate = {rate}\n[calibration]\nfile = "{calibration}"\nunit = "m"\n'
     for k, (name, video) in enumerate(videos.items()):
         text += f'[[camera]]\nname = "{name}"\nvideo = "{video}"\n' + 'image = "letterboxed"\n' * (k < boxed)
-    (folder / "take.toml").write_text(text)
-    seen = load_observations(prepared(read_take(folder / "take.toml")))
+    seen = seen_of(text, detect=True)
     assert seen.rig is not None
     return Seen(seen.rig, persons(seen.rig, seen.keypoints))

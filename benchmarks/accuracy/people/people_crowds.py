@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.scenes.simulated import to_and_fro
 from kinefit.bodies import load_body
 from kinefit.bodies.motion import Motion
 from kinefit.geometry import se3
@@ -55,30 +56,43 @@ def crowd(kind: str, seed: int, frames: int = 150, keypoint_set: str = SET, nois
     motions = []
     for k, (body, path) in enumerate(zip(bodies, paths)):
         name = {"shake hands": "shake_hands" if k < 2 else rest[k], "cross": "walk"}.get(kind, rest[k])
-        motions.append(_along(movement(str(name), body, rate=RATE), path, frames))
+        motions.append(along(movement(str(name), body, rate=RATE), path, frames))
     there = np.ones((frames, count), bool)
     if kind == "leave":
         there[frames // 3 : frames // 3 + 45, 1] = False
     if kind == "relieve":  # a quarter of a second to a second apart
         there[frames // 2 :, 1] = False
         there[: frames // 2 + random.integers(round(0.25 * RATE), round(RATE)), 2] = False
-    rig = studio_rig(_together(motions), cameras=4 + seed % 2)
+    rig = studio_rig(together(motions), cameras=4 + seed % 2)
     each = [
         simulate_keypoints(m, rig, keypoint_set, noise_px=noise_px, seed=100 * seed + k) for k, m in enumerate(motions)
     ]
+    return Crowd(tuple(motions), rig, *listed(motions, rig, each, there, random, through=_SEEN_THROUGH), there)
+
+
+def listed(
+    motions: Sequence[Motion], rig: Rig, each: Sequence[Sequence[Keypoints]], there: NDArray,
+    random: np.random.Generator, *, through: float = 0.0,
+) -> tuple[tuple[Keypoints, ...], tuple[NDArray, ...]]:  # fmt: skip
+    """Records of all people in one list, in an order that changes, and where each of them is in it (F, P).
+
+    What another hides is not seen, but for a share `through` of it.
+    """
     records, orders = [], []
     for c, camera in enumerate(rig):
-        order = np.stack([random.permutation(count) for _ in range(frames)])
+        order = np.stack([random.permutation(len(motions)) for _ in range(len(there))])
         points = np.stack([e[c].points[:, 0] for e in each], axis=1)
         confidence = np.stack([e[c].confidence[:, 0] for e in each], axis=1)
-        hidden = _hidden(motions, camera, there, keypoint_set) & (random.uniform(size=confidence.shape) > _SEEN_THROUGH)
-        gone = hidden | ~there[..., None]
+        gone = hidden(motions, camera, there, each[0][c].keypoint_set)
+        if through:
+            gone &= random.uniform(size=confidence.shape) > through
+        gone |= ~there[..., None]
         points[gone], confidence[gone] = np.nan, 0.0
         points = np.take_along_axis(points, order[:, :, None, None], axis=1)
         confidence = np.take_along_axis(confidence, order[:, :, None], axis=1)
-        records.append(Keypoints(camera.name, keypoint_set, each[0][c].names, RATE, points, confidence))
+        records.append(replace(each[0][c], points=points, confidence=confidence))
         orders.append(np.argsort(order, axis=1))
-    return Crowd(tuple(motions), rig, tuple(records), tuple(orders), there)
+    return tuple(records), tuple(orders)
 
 
 def _paths(kind: str, count: int, frames: int, random: np.random.Generator) -> list[NDArray]:
@@ -115,11 +129,9 @@ def _paths(kind: str, count: int, frames: int, random: np.random.Generator) -> l
     return out
 
 
-def _along(motion: Motion, path: NDArray, frames: int) -> Motion:
+def along(motion: Motion, path: NDArray, frames: int) -> Motion:
     """A movement repeated to and fro, by a person who goes along a path."""
-    length = len(motion)
-    at = np.arange(frames) % (2 * length - 2)
-    at = np.where(at < length, at, 2 * length - 2 - at)
+    at = to_and_fro(len(motion), frames)
     T = motion.Ts_world_root[at].copy()
     if motion.name == "walk":
         T[:, [0, 2], 3] = 0.0
@@ -139,14 +151,14 @@ def _cut(motion: Motion, at: NDArray) -> Motion:
     )
 
 
-def _together(motions: Sequence[Motion]) -> Motion:
+def together(motions: Sequence[Motion]) -> Motion:
     """One motion that goes wherever any of the people does, for the cameras to be set up around."""
     at = np.arange(len(motions[0])) % len(motions)
     T = np.stack([motions[k].Ts_world_root[f] for f, k in enumerate(at)])
     return replace(motions[0], Ts_world_root=T)
 
 
-def _hidden(motions: Sequence[Motion], camera: Camera, there: NDArray, keypoint_set: str = SET) -> NDArray:
+def hidden(motions: Sequence[Motion], camera: Camera, there: NDArray, keypoint_set: str = SET) -> NDArray:
     """(F, P, K) whether a body in front of it hides a point from a camera."""
     x = np.stack([m.positions(m.body.keypoints(keypoint_set)) for m in motions], axis=1)
     joints = np.stack([m.segment_poses()[..., :3, 3] for m in motions], axis=1)

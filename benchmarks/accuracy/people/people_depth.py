@@ -11,15 +11,17 @@ Nothing was fitted to them. Two people are in the first and the last image of th
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, each, figure, recording
-from kinefit import Motion, track_take
+from benchmarks.scenes.takes import tracked
+from benchmarks.timing import took
+from kinefit import Motion
 from kinefit.bodies.motion import BELIEVED
 from kinefit.readers.take.load import Observations
 
@@ -96,12 +98,10 @@ def _kinect() -> None:
             (Path(work) / f"depth-data-{name}").symlink_to(folder / f"depth-data-{name}")
         text = _TAKE.format(rate=1.0, frames=len(names), folder=work, unit=0.001, lens=[575.0, 575.0, 319.5, 239.5],
                             range=[0.5, 5.0], more="size = [640, 480]\n")  # fmt: skip
-        begin = time.process_time()
-        motion, seen = _tracked(text, Path(work))
-        spent = (time.process_time() - begin) / len(names)
+        (motion, seen), spent = took(partial(tracked, text))
         gaps = _gaps(motion, seen, dict(enumerate(KINECT[name] for name in names)))
     figure("people_kinect_images", float(np.sum(motion.quality > 0.0)), *_GOALS["people_kinect_images"])
-    _figures("people_kinect", [gap for (_, of), gap in gaps.items() if of != "head"], 0.06, spent)
+    _figures("people_kinect", [gap for (_, of), gap in gaps.items() if of != "head"], 0.06, spent / len(names))
     heads = [gap for (_, of), (gap, _) in gaps.items() if of == "head"]
     print(f"# heads, the middle between the ears: median {100 * float(np.median(heads)):.0f} cm off")
     _tell(gaps, names, 0.06)
@@ -112,13 +112,11 @@ def _sr305() -> None:
     every, spent = [], []
     for take, images in list(SR305.items())[: amount(None, 1)]:
         count = amount(len(images), 1)
-        with tempfile.TemporaryDirectory() as work:
-            text = _TAKE.format(rate=1.5, frames=count, folder=folder / take, unit=0.000125, range=[0.2, 2.0], more="",
-                                lens=[476.007, 476.007, 313.683, 242.755])  # fmt: skip
-            begin = time.process_time()
-            motion, seen = _tracked(text, Path(work))
-            spent.append((time.process_time() - begin) / count)
-            gaps = _gaps(motion, seen, dict(enumerate(list(images.values())[:count])))
+        text = _TAKE.format(rate=1.5, frames=count, folder=folder / take, unit=0.000125, range=[0.2, 2.0], more="",
+                            lens=[476.007, 476.007, 313.683, 242.755])  # fmt: skip
+        (motion, seen), seconds = took(partial(tracked, text))
+        spent.append(seconds / count)
+        gaps = _gaps(motion, seen, dict(enumerate(list(images.values())[:count])))
         print(f"# {take}")
         _tell(gaps, list(images), 0.04)
         every += list(gaps.values())
@@ -132,12 +130,6 @@ def _figures(area: str, gaps: list[tuple[float, bool]], limit: float, spent: flo
     for name, value in {**{name: float(np.sum(of)) for name, of in counts.items()}, "seconds": spent}.items():
         figure(f"{area}_{name}", value, *_GOALS[f"{area}_{name}"])
     print(f"# {area}: {100 * float(np.mean(right | lost)):.0f} % right or said to be lost")
-
-
-def _tracked(text: str, work: Path) -> tuple[Motion, Observations]:
-    path = work / "take.toml"
-    path.write_text(text, encoding="utf-8")
-    return track_take(path)
 
 
 def _gaps(motion: Motion, seen: Observations, read: Mapping[int, Read]) -> dict[tuple[int, str], tuple[float, bool]]:

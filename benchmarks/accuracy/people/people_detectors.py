@@ -23,6 +23,7 @@ from kinefit.fitting.tracking.recording import Recording
 from kinefit.fitting.tracking.video import track
 from kinefit.simulation import cut, simulate_keypoints, studio_rig
 from kinefit.simulation.evaluation import coverage, joint_errors
+from kinefit.simulation.keypoints import drift
 
 DETECTORS = ("openpose", "mediapipe")
 SIMULATED = "jump 02_04", "walk 12_01", "wave"
@@ -56,15 +57,15 @@ def run() -> None:
 def _simulated(truth: Motion, ratio: float, seed: int) -> tuple[float, ...]:
     """[mm] error of joints by the first detector, the second and both; of the latter, shares inside two deviations."""
     rig, random = studio_rig(truth), np.random.default_rng(seed)
-    segments = (len(rig), len(truth), len(truth.body.tree.segments), 2)
-    common = _BOTH * _drift(segments, truth.rate, random)
+    segments, keep = (len(truth), len(truth.body.tree.segments), 2), np.exp(-1.0 / (truth.rate * _LASTS))
+    common = _BOTH * np.array([drift(segments, keep, random) for _ in rig])
     made = []
     for k, (keypoint_set, worse) in enumerate((("BODY_25B", 1.0), ("MEDIAPIPE_33", ratio))):
         seen = simulate_keypoints(
             truth, rig, keypoint_set, noise_px=worse * _JITTER, drift_px=worse * _ALONE, drift_time=_LASTS,
             outliers=0.03, missing=0.05, seed=2 * seed + k,
         )  # fmt: skip
-        shift = common + worse * _SEGMENT * _drift(segments, truth.rate, random)
+        shift = common + worse * _SEGMENT * np.array([drift(segments, keep, random) for _ in rig])
         made.append(_shifted(truth, seen, shift))
     alone, other, both = (
         track(Recording.of_keypoints(rig, seen, up=truth.up), load_body("humanoid"))
@@ -73,15 +74,6 @@ def _simulated(truth: Motion, ratio: float, seed: int) -> tuple[float, ...]:
     inside = coverage(truth, both)
     errors = (1e3 * float(joint_errors(truth, m).mean()) for m in (alone, other, both))
     return *errors, inside.joints, inside.angles
-
-
-def _drift(shape: tuple[int, int, int, int], rate: float, random: np.random.Generator) -> NDArray:
-    """Values (C, F, S, 2) of unit variance that forget themselves over the frames."""
-    keep = np.exp(-1.0 / (rate * _LASTS))
-    out = random.standard_normal(shape)
-    for f in range(1, shape[1]):
-        out[:, f] = keep * out[:, f - 1] + np.sqrt(1.0 - keep**2) * out[:, f]
-    return out
 
 
 def _shifted(truth: Motion, seen: Sequence[Keypoints], shift: NDArray) -> list[Keypoints]:

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Mapping
@@ -23,7 +21,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.commands import ended
 from benchmarks.figures import NotMeasured, data, figure, quick
+from benchmarks.timing import took
 from kinefit import Motion, load_body, read_motion
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry import se3
@@ -37,8 +37,8 @@ _JOINTS = {
 }  # fmt: skip
 """Bodies of the OpenSim model, and the segments of the humanoid that begin where they do."""
 
-_NAMES = tuple(_JOINTS)
-_HIP, _BACK = np.array([-0.0707, -0.0661, 0.0]), np.array([-0.1007, 0.0815, 0.0])
+NAMES = tuple(_JOINTS)
+_HIP, _BACK = np.array([-0.0563, -0.0785, 0.0]), np.array([-0.1007, 0.0815, 0.0])
 """[m] middle of the hips and the back's joint in the pelvis's frame of the model that OpenCap scales (x forward)."""
 
 _LONG = ("femur_r", "tibia_r"), ("tibia_r", "talus_r"), ("humerus_r", "ulna_r")
@@ -82,15 +82,13 @@ def _of_trial(markers: Path, folder: Path, trial: str) -> Mapping[str, float]:
     times, truth = joints_of_file(markers / "sample_mocap.json")
     rival = against(*joints_of_file(markers / "sample_mono.json"), times, truth)
     height = stature(truth)
-    command("init", str(folder))
+    ended("init", folder, check=True)
     take = folder / "take.toml"
     take.write_text(take.read_text().replace("# height = 1.75", f"height = {height:.2f}  #"))
-    began = time.perf_counter()
-    command("track", str(take))
-    took = time.perf_counter() - began
+    _, seconds = took(lambda: ended("track", take, check=True), clock=time.perf_counter)
     motion = read_motion(folder / "take-kinefit" / "motion.npz")
     take.write_text(take.read_text().replace("height = ", "# height = "))
-    command("track", str(take), "--pictures", "none", "--no-report")
+    ended("track", take, "--pictures", "none", "--no-report", check=True)
     without = read_motion(folder / "take-kinefit" / "motion.npz")
     scale = json.loads((markers / "sample_mocap.json").read_text())["bodies"]["pelvis"]["scaleFactors"][0]
     ours = against(motion.times, joints_of(motion, scale), times, truth, std_of(motion))
@@ -98,16 +96,13 @@ def _of_trial(markers: Path, folder: Path, trial: str) -> Mapping[str, float]:
         told = ", ".join(f"{k.removeprefix('one_camera_')} {v:.3g}" for k, v in found.items() if v == v)
         print(f"{trial}, {name}: {told}", flush=True)
     unstated = against(without.times, joints_of(without, scale), times, truth)
-    print(
-        f"{trial}, no stature: relative {unstated['one_camera_relative']:.1f}, "
-        f"absolute {unstated['one_camera_absolute']:.1f}, height {without.body.stature:.2f} m",
-        flush=True,
-    )
+    print(f"{trial}, no stature: relative {unstated['one_camera_relative']:.1f}, "
+          f"absolute {unstated['one_camera_absolute']:.1f}, height {without.body.stature:.2f} m", flush=True)
     lost, quality = motion.lost.mean(), motion.quality.mean()
     print(f"{trial}: {lost:.1%} of segments lost, quality {quality:.2f}, height {height:.2f} m", flush=True)
-    print(f"{trial}: {len(motion)} frames in {took:.1f} s", flush=True)
+    print(f"{trial}: {len(motion)} frames in {seconds:.1f} s", flush=True)
     ours["one_camera_absolute_without_stature"] = unstated["one_camera_absolute"]
-    return {**ours, "frames": len(motion), "seconds": took}
+    return {**ours, "frames": len(motion), "seconds": seconds}
 
 
 def _balancing() -> None:
@@ -121,7 +116,7 @@ def _balancing() -> None:
         together.mkdir()
         for file in (*(root / "videos").glob("*.mp4"), root / "Calib_refined_static.toml"):
             shutil.copy(file, together)
-        command("init", str(together))
+        ended("init", together, check=True)
         truth = _tracked(together / "take.toml")
         x = joints_of(truth, 1.0)
         for video in sorted(together.glob("*.mp4")):
@@ -129,7 +124,7 @@ def _balancing() -> None:
             (folder / "take-detect").mkdir(parents=True)
             shutil.copy(video, folder)
             shutil.copy(together / "take-detect" / f"{video.stem}.npz", folder / "take-detect")
-            command("init", str(folder))
+            ended("init", folder, check=True)
             take = folder / "take.toml"
             take.write_text(take.read_text().replace("# height = 1.75", f"height = {truth.body.stature:.2f}  #"))
             motion = _tracked(take)
@@ -140,28 +135,20 @@ def _balancing() -> None:
 
 
 def _tracked(take: Path) -> Motion:
-    command("track", str(take), "--person", "first", "--pictures", "none", "--no-report")
+    ended("track", take, "--person", "first", "--pictures", "none", "--no-report", check=True)
     return read_motion(take.with_name("take-kinefit") / "motion.npz")
-
-
-def command(*words: str) -> None:
-    """Run a command."""
-    done = subprocess.run([sys.executable, "-m", "kinefit", *words], capture_output=True, text=True)
-    if done.returncode:
-        raise RuntimeError(done.stderr)
 
 
 def joints_of_file(path: Path) -> tuple[NDArray, NDArray]:
     """(F,) [s] and (F, 12, 3) [m]."""
     told = json.loads(path.read_text())
-    return np.array(told["time"]), np.stack([np.array(told["bodies"][n]["translation"]) for n in _NAMES], axis=1)
+    return np.array(told["time"]), np.stack([np.array(told["bodies"][n]["translation"]) for n in NAMES], axis=1)
 
 
 def stature(x: NDArray) -> float:
-    """[m] of a person whose joints these are (F, 12, 3), by thigh, shank and upper arm."""
     body = load_body("humanoid")
     rest = {name: body.tree.rest[body.tree.segment(s)] for name, s in _JOINTS.items() if s}
-    pairs = [(_NAMES.index(a), _NAMES.index(b)) for a, b in _LONG]
+    pairs = [(NAMES.index(a), NAMES.index(b)) for a, b in _LONG]
     seen = sum(float(np.linalg.norm(x[:, a] - x[:, b], axis=1).mean()) for a, b in pairs)
     assert body.stature
     return round(body.stature * seen / sum(float(np.linalg.norm(rest[a] - rest[b])) for a, b in _LONG), 2)
@@ -171,10 +158,10 @@ def joints_of(motion: Motion, scale: float) -> NDArray:
     """(F, 12, 3) [m] where the model's bodies begin; pelvis and torso by how they lie to the hips in it."""
     tree, centres = motion.body.tree, motion.joint_centres
     x = np.stack([centres[:, tree.segment(s or "pelvis")] for s in _JOINTS.values()], axis=1)
-    hips = x[:, [_NAMES.index("femur_r"), _NAMES.index("femur_l")]].mean(axis=1)
+    hips = x[:, [NAMES.index("femur_r"), NAMES.index("femur_l")]].mean(axis=1)
     R = motion.segment_poses()[:, 0, :3, :3]
-    x[:, _NAMES.index("pelvis")] = hips - scale * R @ _HIP
-    x[:, _NAMES.index("torso")] = hips + scale * R @ (_BACK - _HIP)
+    x[:, NAMES.index("pelvis")] = hips - scale * R @ _HIP
+    x[:, NAMES.index("torso")] = hips + scale * R @ (_BACK - _HIP)
     return x
 
 
@@ -186,15 +173,8 @@ def std_of(motion: Motion) -> NDArray:
 def against(
     times: NDArray, x: NDArray, marker_times: NDArray, truth: NDArray, std: NDArray | None = None
 ) -> dict[str, float]:
-    """Figures of joints (F, 12, 3) [m] with their deviations against those by markers (G, 12, 3) [m]; times [s]."""
-    lines = truth.reshape(len(truth), -1).T
-
-    def laid(shift: float) -> tuple[NDArray, NDArray, NDArray]:
-        there = np.stack([np.interp(times + shift, marker_times, line) for line in lines], axis=1).reshape(x.shape)
-        T = se3.aligned(x.reshape(-1, 3), there.reshape(-1, 3), np.ones(x[..., 0].size))
-        return se3.apply(T, x), there, T
-
-    on, there, T = min(map(laid, _SHIFTS), key=lambda one: float(np.linalg.norm(one[0] - one[1], axis=2).mean()))
+    T, there = laid_on(x, times, marker_times, truth)
+    on = se3.apply(T, x)
     apart = np.linalg.norm((on - on[:, :1]) - (there - there[:, :1]), axis=2)[:, 1:]
     knees = []
     for side in "rl":
@@ -213,9 +193,21 @@ def against(
     }  # fmt: skip
 
 
+def laid_on(x: NDArray, at: NDArray, times: NDArray, truth: NDArray) -> tuple[NDArray, NDArray]:
+    """The pose that lays joints on those of markers, at the shift of clocks that fits best; and those joints then."""
+    lines = truth.reshape(len(truth), -1).T
+
+    def laid(shift: float) -> tuple[float, NDArray, NDArray]:
+        there = np.stack([np.interp(at + shift, times, line) for line in lines], axis=1).reshape(x.shape)
+        T = se3.aligned(x.reshape(-1, 3), there.reshape(-1, 3))
+        return float(np.linalg.norm(se3.apply(T, x) - there, axis=2).mean()), T, there
+
+    return min(map(laid, _SHIFTS), key=lambda one: one[0])[1:]
+
+
 def _knee(x: NDArray, side: str) -> NDArray:
     """(F,) [deg] between thigh and shank, from three points."""
-    hip, knee, ankle = (x[:, _NAMES.index(f"{n}_{side}")] for n in ("femur", "tibia", "talus"))
+    hip, knee, ankle = (x[:, NAMES.index(f"{n}_{side}")] for n in ("femur", "tibia", "talus"))
     a, b = hip - knee, ankle - knee
     cosine = np.sum(a * b, axis=1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.people.people_crowds import RATE, SET, _along, _hidden
+from benchmarks.accuracy.people.people_crowds import RATE, SET, along, hidden
 from kinefit import load_body
 from kinefit.bodies.motion import Motion
 from kinefit.errors import KinefitError
@@ -29,6 +29,7 @@ from kinefit.fitting.tracking.video import track
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import Keypoints
 from kinefit.simulation import simulate_keypoints
+from kinefit.simulation.figures import look_at
 from kinefit.simulation.movements import movement
 from kinefit.simulation.movements import people as persons
 
@@ -52,12 +53,7 @@ def _rig(away: float = 4.2) -> Rig:
     cameras = []
     for k, turn in enumerate(np.radians((25.0, 70.0, 110.0, 155.0))):
         eye = np.array([away * np.cos(turn), 1.5, away * np.sin(turn)])
-        z = np.array([0.2, 0.9, 0.0]) - eye
-        z /= np.linalg.norm(z)
-        x = np.cross(z, [0.0, 1.0, 0.0])
-        T = np.eye(4)
-        T[:3, :3] = np.stack([x / np.linalg.norm(x), np.cross(z, x) / np.linalg.norm(x), z])
-        T[:3, 3] = -T[:3, :3] @ eye
+        T = look_at(eye, np.array([0.2, 0.9, 0.0]), np.array([0.0, 1.0, 0.0]))
         matrix = np.array([[720.0, 0.0, 639.5], [0.0, 720.0, 479.5], [0.0, 0.0, 1.0]])
         cameras.append(Camera(f"cam{k + 1:02d}", (1280, 960), matrix, T_camera_world=T))
     return Rig(tuple(cameras))
@@ -70,7 +66,7 @@ def _someone(
     body = persons(load_body("humanoid"), count=1, seed=seed)[0].body
     px = np.linspace(x, x if to is None else to, FRAMES)
     path = np.column_stack([px, np.full(FRAMES, z), np.full(FRAMES, turn)])
-    return _along(movement(name, body, rate=RATE), path, FRAMES)
+    return along(movement(name, body, rate=RATE), path, FRAMES)
 
 
 def _seen(motions: Sequence[Motion], rig: Rig) -> list[list[Pixels]]:
@@ -79,9 +75,9 @@ def _seen(motions: Sequence[Motion], rig: Rig) -> list[list[Pixels]]:
     each = [simulate_keypoints(m, rig, SET, seed=k) for k, m in enumerate(motions)]
     out = []
     for c, camera in enumerate(rig):
-        hidden = _hidden(motions, camera, there)
+        behind = hidden(motions, camera, there)
         out.append([
-            (e[c].points[:, 0], np.where(hidden[:, k], 0.0, e[c].confidence[:, 0])) for k, e in enumerate(each)
+            (e[c].points[:, 0], np.where(behind[:, k], 0.0, e[c].confidence[:, 0])) for k, e in enumerate(each)
         ])  # fmt: skip
     return out
 
@@ -163,7 +159,7 @@ def _returning(*sizes: float) -> Case:
     for k, size in enumerate(sizes):
         own = body.scaled([size] * len(body.scale_groups))
         path = np.column_stack([side if k else -side, np.full(FRAMES, 0.1), np.full(FRAMES, 0.6)])
-        motions.append(_along(movement("wave", own, rate=RATE), path, FRAMES))
+        motions.append(along(movement("wave", own, rate=RATE), path, FRAMES))
     rig = _rig()
     there = (np.arange(FRAMES) < GONE) | (np.arange(FRAMES) >= BACK)
     seen = [[(uv, np.where(there[:, None], sure, 0.0)) for uv, sure in each] for each in _seen(motions, rig)]

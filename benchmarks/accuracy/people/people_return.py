@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.people.people_crowds import RATE, SET, _along, _hidden, _together
+from benchmarks.accuracy.people.people_crowds import RATE, SET, along, listed, together
 from benchmarks.accuracy.people.people_real import take_of
+from benchmarks.accuracy.people.people_simulated import owners_of
 from benchmarks.figures import amount, each, figure, quick, whole_recording
 from kinefit.bodies import Body, load_body
 from kinefit.bodies.motion import Motion
@@ -95,22 +96,11 @@ def scene(kind: str, seed: int) -> Scene:
         if k:
             path[back:, :2] = places[3 - k] + random.uniform(-0.2, 0.2, 2)
             path[back:, 2] = random.uniform(-np.pi, np.pi)
-        motions.append(_along(movement(str(random.choice(_MOVEMENTS)), own, rate=RATE), path, frames))
-    rig = studio_rig(_together(motions), cameras=4)
+        motions.append(along(movement(str(random.choice(_MOVEMENTS)), own, rate=RATE), path, frames))
+    rig = studio_rig(together(motions), cameras=4)
     each = [simulate_keypoints(m, rig, SET, drift_px=3.0, seed=100 * seed + k) for k, m in enumerate(motions)]
-    records, orders = [], []
-    for c, camera in enumerate(rig):
-        order = np.stack([random.permutation(3) for _ in range(frames)])
-        points = np.stack([e[c].points[:, 0] for e in each], axis=1)
-        confidence = np.stack([e[c].confidence[:, 0] for e in each], axis=1)
-        hidden = _hidden(motions, camera, there) | ~there[..., None]
-        points[hidden], confidence[hidden] = np.nan, 0.0
-        points = np.take_along_axis(points, order[:, :, None, None], axis=1)
-        confidence = np.take_along_axis(confidence, order[:, :, None], axis=1)
-        records.append(Keypoints(camera.name, SET, each[0][c].names, RATE, points, confidence))
-        orders.append(np.argsort(order, axis=1))
-    pictures = _drawn(motions, rig, there, worn, seed)
-    return Scene(rig, tuple(records), tuple(orders), there, gone, back, pictures)
+    records, orders = listed(motions, rig, each, there, random)
+    return Scene(rig, records, orders, there, gone, back, _drawn(motions, rig, there, worn, seed))
 
 
 def _adult(body: Body, random: np.random.Generator) -> Body:
@@ -163,10 +153,7 @@ def judged(seen: Scene, people: list[PersonTrack]) -> tuple[int, int, int]:
     after = np.arange(len(seen.there)) >= seen.back
     of = []
     for one in people:
-        whose = np.array([
-            np.where(m := (o == c[:, None]) & (c[:, None] >= 0), np.arange(m.shape[1]), -1).max(axis=1)
-            for o, c in zip(seen.order, one.chosen)
-        ])  # fmt: skip
+        whose = owners_of(seen.order, one.chosen)
         of.append(tuple(
             np.bincount(w[w >= 0], minlength=seen.there.shape[1]).argmax() if (w := whose[:, part]).max() >= 0 else -1
             for part in (~after, after)

@@ -34,7 +34,7 @@ def run() -> None:
         for seed in SEEDS:
             seen = rough(crowd(kind, seed, amount(200, 150), "COCO_17", _NOISE), seed)
             people = people_of(seen.rig, seen.keypoints)
-            whose = [owners_of(seen, one.chosen) for one in people]
+            whose = [owners_of(seen.order, one.chosen) for one in people]
             owners = [int(np.bincount(w[w >= 0]).argmax()) for w in whose]
             mixed = sum(int(((w >= 0) & (w != owner)).sum()) for w, owner in zip(whose, owners))
             taken, given = taken + mixed, given + sum(int((w >= 0).sum()) for w in whose)
@@ -70,7 +70,7 @@ def _close(on_one: int) -> None:
         print(f"# throng {seed}: found {len(people)} of {len(seen.motions)}, {two} frames with two on one", flush=True)
     for seed in RELIEVED_SEEDS:
         seen = crowd("relieve", seed, amount(200, 150), "COCO_17", _NOISE)
-        owners = [owners_of(seen, one.chosen) for one in people_of(seen.rig, seen.keypoints)]
+        owners = [owners_of(seen.order, one.chosen) for one in people_of(seen.rig, seen.keypoints)]
         relieved += any((of == 1).any() and (of == 2).any() for of in owners)
     figure("people_on_one", float(on_one), "frames in which two tracked bodies stand on one person", "== 0")
     figure("people_relieved", float(relieved), f"of {len(RELIEVED_SEEDS)} who leave and who come taken for one", "== 0")

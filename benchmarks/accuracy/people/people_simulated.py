@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 import numpy as np
 
 from benchmarks.accuracy.people.people_crowds import KINDS, Crowd, crowd
 from benchmarks.figures import amount, figure, quick
+from benchmarks.timing import timed
 from kinefit import Motion, load_body
 from kinefit.fitting.multiview.followed import PersonKeypoints, follow
 from kinefit.fitting.multiview.people import PersonTrack, people_of
@@ -28,7 +28,7 @@ def run() -> None:
     for kind, seed in sequences[:2] if quick() else sequences:
         seen = crowd(kind, seed, amount(150, 45))
         people = people_of(seen.rig, seen.keypoints)
-        whose = [owners_of(seen, one.chosen) for one in people]
+        whose = [owners_of(seen.order, one.chosen) for one in people]
         others = [(w >= 0) & (w != np.bincount(w[w >= 0]).argmax()) for w in whose]
         exchanged += sum(int(np.any(2 * o.sum(axis=0) > (w >= 0).sum(axis=0))) for o, w in zip(others, whose))
         mixed = sum(int(o.sum()) for o in others)
@@ -54,10 +54,10 @@ def run() -> None:
     _speed()
 
 
-def owners_of(seen: Crowd, chosen: tuple) -> np.ndarray:
+def owners_of(orders: Sequence[np.ndarray], chosen: Sequence[np.ndarray]) -> np.ndarray:
     """(C, F) whose detections somebody has, -1 for none."""
     out = []
-    for mine, order in zip(chosen, seen.order):
+    for mine, order in zip(chosen, orders):
         match = (order == mine[:, None]) & (mine[:, None] >= 0)
         out.append(np.where(match.any(axis=1), match.argmax(axis=1), -1))
     return np.array(out)
@@ -100,13 +100,12 @@ def _speed() -> None:
         seen = crowd(kind, 0, amount(150, 45))
         times = []
         for _ in range(amount(3, 1)):
-            began = time.process_time()
-            people = people_of(seen.rig, seen.keypoints)
-            for k in range(len(people)):
-                one = follow(seen.rig, seen.keypoints, k + 1, people)  # who is who is found once, as by the command
-                alone = _alone(seen, one, k)
-                track(alone, load_body("humanoid"), smooth=False)
-            times.append(time.process_time() - began)
+            with timed(times):
+                people = people_of(seen.rig, seen.keypoints)
+                for k in range(len(people)):
+                    one = follow(seen.rig, seen.keypoints, k + 1, people)  # who is who is found once, as by the command
+                    alone = _alone(seen, one, k)
+                    track(alone, load_body("humanoid"), smooth=False)
         spent[count] = min(times) / len(seen.keypoints[0])
         print(f"# {count} people, {len(seen.rig)} cameras: {1 / spent[count]:.0f} frames/s, all but smoothing")
     figure("people_speed_two", 1 / spent[2], "frames/s", ">= 100")

@@ -19,6 +19,7 @@ from benchmarks.accuracy.mixed import mixed_takes as takes
 from benchmarks.accuracy.mixed.mixed_cameras import errors
 from benchmarks.accuracy.video.tracking import read_trial
 from benchmarks.figures import amount, each, figure, recording
+from benchmarks.scenes.simulated import calibrated
 from kinefit import Recording, load_body
 from kinefit.fitting.tracking.cameras import contradiction_sentences as contradicting
 from kinefit.fitting.tracking.cameras import sentences as moved
@@ -55,7 +56,7 @@ def _all_off(times: int, draws: range) -> None:
         random = np.random.default_rng([13, draw])
         truth = takes.moved(takes.name_of(draw), takes.person(random), OFF_FRAMES, random)
         rig = studio_rig(truth)
-        wrong = Rig(tuple(c.with_pose(takes.camera_error(random, times) @ c.T_camera_world) for c in rig))
+        wrong = calibrated(rig, random, times)
         seen = simulate_keypoints(truth, rig, takes.DETECTOR, drift_px=2.0, outliers=0.1, seed=draw)
         motion = track(Recording.of_keypoints(wrong, seen, up=truth.up), load_body("humanoid"))
         joints, angles, places = errors(truth, motion)

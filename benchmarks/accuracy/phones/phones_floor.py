@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable
 from itertools import count, islice
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.people import people_one_camera
+from benchmarks.accuracy.people.people_one_camera import NAMES, joints_of, joints_of_file, laid_on
 from benchmarks.accuracy.phones import phones_rooms
 from benchmarks.accuracy.phones.phones_real import RECORDINGS, _tracked
 from benchmarks.figures import amount, each, figure, recording, whole_recording
@@ -50,10 +49,10 @@ def _of_walk() -> None:
         shutil.copy(trial / "video.mp4", Path(work, "walk.mp4"))
         Path(work, "take.toml").write_text(guess_take(Path(work)).text, encoding="utf-8")
         motion = track_take(Path(work, "take.toml"))[0]
-    times, truth = people_one_camera._joints_of_file(trial / "sample_mocap.json")
-    own = people_one_camera._joints_of(motion, 1.0)
-    T, there = _laid_on(own, motion.times, times, truth)
-    ankles = [people_one_camera._NAMES.index(f"talus_{side}") for side in "rl"]
+    times, truth = joints_of_file(trial / "sample_mocap.json")
+    own = joints_of(motion, 1.0)
+    T, there = laid_on(own, motion.times, times, truth)
+    ankles = [NAMES.index(f"talus_{side}") for side in "rl"]
     rests = np.stack([_rests(there[:, k][:, None], motion.rate) for k in ankles], axis=1)
     heights = [float(own[s:e, k, 2].mean()) for k, rest in zip(ankles, rests.T, strict=True) for s, e in runs_of(rest)]
     figure("phones_floor_walk_tilt", _tilt(T, np.array([0.0, 1.0, 0.0])), units["tilt"], "<= 1")
@@ -111,19 +110,6 @@ def _of_balancing() -> None:
     frames = min(len(motion), len(known))
     x, y = (m.joint_centres[:frames].reshape(-1, 3) for m in (motion, known))
     figure("phones_floor_balancing_tilt", _tilt(se3.aligned(x, y), np.array([0.0, 0.0, 1.0])), unit, "<= 1")
-
-
-def _laid_on(x: NDArray, at: NDArray, times: NDArray, truth: NDArray) -> tuple[NDArray, NDArray]:
-    """The pose that lays joints on those of markers, at the shift of clocks that fits best; and those joints then."""
-    lines = truth.reshape(len(truth), -1).T
-
-    def laid(shift: float) -> tuple[float, NDArray, NDArray]:
-        there = np.stack([np.interp(at + shift, times, line) for line in lines], axis=1).reshape(x.shape)
-        T = se3.aligned(x.reshape(-1, 3), there.reshape(-1, 3))
-        return float(np.linalg.norm(se3.apply(T, x) - there, axis=2).mean()), T, there
-
-    first: Callable[[tuple[float, NDArray, NDArray]], float] = lambda one: one[0]
-    return min(map(laid, people_one_camera._SHIFTS), key=first)[1:]
 
 
 def _tilt(T: NDArray, up: NDArray) -> float:

@@ -32,6 +32,7 @@ from kinefit.readers.calibration.read import FoundCameras, read_found, write_cal
 from kinefit.readers.landmarks.keypoint_sets import MEDIAPIPE_33
 from kinefit.simulation import cut, known_motion, resampled, simulate_keypoints
 from kinefit.simulation.evaluation import angle_errors
+from kinefit.simulation.figures import look_at
 from kinefit.simulation.keypoints import drift
 from kinefit.takes.missing import cameras_file
 
@@ -121,12 +122,8 @@ def _telephones(motion: Motion, random: np.random.Generator) -> Rig:
         far = random.uniform(2.5, 5.0) + reach
         place = middle + far * np.array([np.cos(angle), np.sin(angle), 0.0])
         place[2] = random.uniform(0.6, 2.2)
-        aim = middle + random.normal(0.0, 0.15, 3) - place
-        z = aim / np.linalg.norm(aim)
-        across = np.cross(z, [0.0, 0.0, 1.0])
-        across /= np.linalg.norm(across)
-        R = np.stack([across, np.cross(z, across), z])
-        R = se3.exp_so3(np.array([0.0, 0.0, np.radians(random.normal(0.0, 3.0))])) @ R
+        level = look_at(place, middle + random.normal(0.0, 0.15, 3), np.array([0.0, 0.0, 1.0]))
+        R = se3.exp_so3(np.array([0.0, 0.0, np.radians(random.normal(0.0, 3.0))])) @ level[:3, :3]
         size = (1080, 1920) if random.random() < 0.5 else (1920, 1080)
         focal = 960.0 / np.tan(np.radians(random.normal(64.0, 8.0)) / 2.0)
         K = np.array([[focal, 0.0, (size[0] - 1) / 2], [0.0, focal, (size[1] - 1) / 2], [0.0, 0.0, 1.0]])

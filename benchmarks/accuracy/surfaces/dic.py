@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import LEFT_OUT, amount, figure, peers, quick, recording
 from benchmarks.peers.environments import run_peer
+from benchmarks.timing import fastest
 from kinefit.images.photogrammetry.least_squares_matching import Grid, Matches, Seeds, grow
 from kinefit.images.photogrammetry.spline_image import SplineImage
 from kinefit.images.photogrammetry.strain import Strain, strain
@@ -69,12 +70,8 @@ def _against_pyvale(sample: Sample) -> None:
             (where / "pair.json").write_text(json.dumps(wanted))
             told = run_peer("pyvale", where)
         for window in WINDOWS:
-            spent = []
-            for _ in range(amount(3, 1)):
-                began = time.process_time()
-                grid, matches = sample.matched("L3", window)
-                spent.append(time.process_time() - began)
-            rate = matches.found.sum() / min(spent)
+            (grid, matches), spent = fastest(partial(sample.matched, "L3", window), amount(3, 1))
+            rate = matches.found.sum() / spent
             ours = _table(grid.points, matches.uv - grid.points)
             share = 100 * matches.found.mean()
             error = (matches.uv - grid.points)[:, 0] - sample.shift["L3"][grid.points[:, 0].astype(int)]

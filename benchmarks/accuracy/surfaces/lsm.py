@@ -9,14 +9,12 @@ seeds not used in development; the bias curve has no noise, one shift for all, a
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
+from benchmarks.timing import fastest
 from kinefit.images.photogrammetry.least_squares_matching import Matches, match
 from kinefit.images.photogrammetry.spline_image import SplineImage
 
@@ -82,12 +80,13 @@ def _precision() -> None:
         return match(SplineImage.of(first), SplineImage.of(second), at)
 
     ours()
-    matches, spent = _timed(ours)
+    times = amount(3, 1)
+    matches, spent = fastest(ours, times)
     error = (matches.uv - goal)[matches.found]
     rms = float(np.sqrt(np.mean(error**2)))
     inside = 100 * float(np.mean(np.abs(error) <= 1.96 * matches.std[matches.found]))
-    lk, lk_spent = _timed(lambda: _lucas_kanade(bytes1, bytes2, at))
-    ecc, ecc_spent = _timed(lambda: _ecc(first, second, at))
+    lk, lk_spent = fastest(lambda: _lucas_kanade(bytes1, bytes2, at), times)
+    ecc, ecc_spent = fastest(lambda: _ecc(first, second, at), times)
     lk_rms, ecc_rms = _rms(lk - goal), _rms(ecc - goal)
     count = len(at)
     print(f"# {count} tiles; RMS [px], found [%], points/s: kinefit {rms:.4f}, {100 * matches.found.mean():.1f}, "
@@ -121,16 +120,6 @@ def _bias() -> None:
         worst[grain] = np.abs(told).max()
         print(f"# bias, grain {grain} px: " + ", ".join(f"{s:g} px {b:+.5f}" for s, b in zip(shifts, told)))
     figure("lsm_bias_grain_1", worst[1.0], "px", "<= 0.002")
-
-
-def _timed(work: Callable[[], object]) -> tuple:
-    """What a call gives, and its CPU time [s], the least of three."""
-    spent, out = [], None
-    for _ in range(amount(3, 1)):
-        began = time.process_time()
-        out = work()
-        spent.append(time.process_time() - began)
-    return out, min(spent)
 
 
 def _rms(error: NDArray) -> float:

@@ -11,7 +11,6 @@ The real arm (`stereo_arm_handpose3d`): two webcams turned by 74 degrees against
 from __future__ import annotations
 
 import os
-import time
 from pathlib import Path
 
 import cv2
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from benchmarks.accuracy.surfaces.lsm import Texture
 from benchmarks.figures import amount, figure, recording
 from benchmarks.papers.silhouettes.silhouettes_arm import SKIN, camera
+from benchmarks.timing import timed
 from kinefit.errors import KinefitError
 from kinefit.exporters.surface_files import write_field_picture
 from kinefit.geometry import se3
@@ -31,6 +31,7 @@ from kinefit.images.photogrammetry.surface import measure, measure_states, surfa
 from kinefit.images.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
 from kinefit.images.photogrammetry.trajectories import Trajectories, uniform, within_bounds
 from kinefit.readers.videos.video import Video
+from kinefit.simulation.figures import look_at
 
 RADIUS, SIZE, SEED = 0.045, (400, 300), 4242
 FALSE = 0.002  # [m]
@@ -45,13 +46,9 @@ def run() -> None:
 def _rig() -> Rig:
     cameras = []
     for name, x in (("middle", 0.0), ("left", -0.18), ("right", 0.18)):
-        place = np.array([x, 0.02, -1.0])
-        z = -place / np.linalg.norm(place)
-        across = np.cross((0.0, 1.0, 0.0), z)
-        across /= np.linalg.norm(across)
-        R = np.stack([across, np.cross(z, across), z])
+        T = look_at(np.array([x, 0.02, -1.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
         K = [[1100.0, 0, SIZE[0] / 2], [0, 1100.0, SIZE[1] / 2], [0, 0, 1]]
-        cameras.append(Camera(name, SIZE, K, (-0.05, 0.01, 0, 0), "radtan", se3.transform(R, -R @ place)))
+        cameras.append(Camera(name, SIZE, K, (-0.05, 0.01, 0, 0), "radtan", T))
     return Rig(tuple(cameras))
 
 
@@ -79,12 +76,11 @@ def _limb() -> None:
     rig, rng, texture = _rig(), np.random.default_rng(SEED), Texture(SEED, grain=1.4, waves=100)
     u, v = np.meshgrid(np.arange(SIZE[0], dtype=float), np.arange(SIZE[1], dtype=float))
     rays = [camera.ray(np.stack([u, v], axis=-1).reshape(-1, 2)) for camera in rig]
-    tracker, live, spent = SurfaceTracker(rig, 30.0, SurfaceTracking(step=6)), [], 0.0
+    tracker, live, spent = SurfaceTracker(rig, 30.0, SurfaceTracking(step=6)), [], list[float]()
     for frame in range(amount(100, 4)):
         images = [drawn(view, d, texture, frame, rng) for view, d in zip(rig, rays)]
-        began = time.process_time()
-        live.append(len(tracker.update(images)))
-        spent += time.process_time() - began if frame else 0.0
+        with timed(spent):
+            live.append(len(tracker.update(images)))
     paths = tracker.trajectories()
     good = uniform(paths, radius=0.02) & within_bounds(paths, speed=3.0, acceleration=100.0)
     filtered = paths.kept(good)
@@ -99,7 +95,8 @@ def _limb() -> None:
     figure("surface_limb_regenerated", len(paths.x_world[0]) - live[0], "points", ">= 1")
     if os.environ.get("KINEFIT_PICTURES"):
         _draw(rig, rays, texture, Path(os.environ["KINEFIT_PICTURES"]) / "surface_limb.png")
-    print(f"# CPU {1e3 * spent / max(len(live) - 1, 1):.0f} ms a frame for {np.mean(live):.0f} points in three views")
+    ms = 1e3 * sum(spent[1:]) / max(len(live) - 1, 1)
+    print(f"# CPU {ms:.0f} ms a frame for {np.mean(live):.0f} points in three views")
 
 
 def _draw(rig: Rig, rays: list[NDArray], texture: Texture, path: Path) -> None:

@@ -11,13 +11,12 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-import cv2
 import numpy as np
-from click.testing import CliRunner
 from numpy.typing import NDArray
 
+from benchmarks.commands import printed
 from benchmarks.figures import amount, figure
-from benchmarks.scenes.textured import textured_picture
+from benchmarks.scenes.textured import textured_picture, write_video
 from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.surfaces.places import body_mesh
@@ -25,6 +24,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.motion import read_motion
+from kinefit.simulation.figures import look_at
 from kinefit.simulation.rendering.scenes import SimulatedScene
 
 OFF = {"arm_flex_r": 4.0, "arm_add_r": -4.0, "arm_rot_r": 4.0, "elbow_flex_r": -4.0, "pro_sup_r": 5.0}  # [deg]
@@ -65,12 +65,9 @@ def cameras(size: int) -> Rig:
     out, aim = [], np.array([0.2, -0.3, 0.0])
     for name, x in (("middle", 0.0), ("left", -0.2), ("right", 0.2)):
         place = np.array([0.2 + x, -0.2, 1.3])
-        forward = (aim - place) / np.linalg.norm(aim - place)
-        right = np.cross(forward, [0.0, 1.0, 0.0])
-        right /= np.linalg.norm(right)
-        R = np.stack([right, np.cross(forward, right), forward])
+        T = look_at(place, aim, np.array([0.0, 1.0, 0.0]))
         K = np.array([[1.6 * size, 0, size / 2], [0, 1.6 * size, size / 2], [0, 0, 1]])
-        out.append(Camera(name, (size, size), K, np.zeros(4), "radtan", se3.transform(R, -R @ place)))
+        out.append(Camera(name, (size, size), K, np.zeros(4), "radtan", T))
     return Rig(tuple(out))
 
 
@@ -79,12 +76,9 @@ def record(folder: Path, motion: Motion, rig: Rig, seed: int) -> None:
     scene = SimulatedScene(motion, body_mesh(motion.body, around=64))
     write_calibration(rig, folder / "calib.toml")
     for camera in rig:
-        code = cv2.VideoWriter_fourcc(*"MJPG")
-        video = cv2.VideoWriter(str(folder / f"{camera.name}.avi"), code, motion.rate, camera.size)
-        for k in range(len(motion)):
-            grain = 0.0026 * 640 / camera.size[0]
-            video.write(cv2.cvtColor(textured_picture(scene, k, camera, grain=grain, seed=seed), cv2.COLOR_GRAY2BGR))
-        video.release()
+        grain = 0.0026 * 640 / camera.size[0]
+        images = (textured_picture(scene, k, camera, grain=grain, seed=seed) for k in range(len(motion)))
+        write_video(folder / f"{camera.name}.avi", images, motion.rate)
     start = {n: float(np.degrees(a)) for n, a in zip(motion.body.tree.coordinates, motion.angles[0])}
     told = ", ".join(f"{name} = {value + OFF.get(name, 0.0):.3f}" for name, value in start.items())
     (folder / "take.toml").write_text(
@@ -98,18 +92,11 @@ def errors(folder: Path, seed: int, *, frames: int, size: int) -> dict[str, floa
     """RMS errors [deg] of the elbow's and wrist's angles, also without their means and in stated standard deviations,
     and of the upper arm's turn.
     """
-    from kinefit.cli import main
-
     motion, rig = moving_arm(seed, frames), cameras(size)
     record(folder, motion, rig, seed)
     views = [f"{camera.name}={folder / camera.name}.avi" for camera in rig]
-    for words in (
-        ["surface", str(folder / "calib.toml"), *views, "-o", str(folder / "surface")],
-        ["track", str(folder / "take.toml"), "-o", str(folder / "result")],
-    ):
-        told = CliRunner().invoke(main, words)
-        if told.exit_code:
-            raise RuntimeError(told.output)
+    printed("surface", folder / "calib.toml", *views, "-o", folder / "surface")
+    printed("track", folder / "take.toml", "-o", folder / "result")
     print(f"  {len((folder / 'surface' / 'trajectories.csv').read_text().splitlines()) - 1} places of points")
     found = read_motion(folder / "result" / "motion.npz")
     names = motion.body.tree.coordinates

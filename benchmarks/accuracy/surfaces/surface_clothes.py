@@ -15,9 +15,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from click.testing import CliRunner
 from numpy.typing import NDArray
 
+from benchmarks.commands import answer
 from benchmarks.figures import amount, data, figure
 from kinefit.images.photogrammetry.least_squares_matching import match
 from kinefit.images.photogrammetry.matching.multi_image import search_box
@@ -90,8 +90,6 @@ def _step(old: SplineImage, new: SplineImage, uv: NDArray) -> tuple[NDArray, NDA
 
 def measured(folder: Path, patch: Patch) -> int:
     """Points that the command measures in the box; none where it finds nothing in common."""
-    from kinefit.cli import main
-
     with tempfile.TemporaryDirectory() as place:
         work, views = Path(place), []
         for camera in (patch.camera, patch.other):
@@ -104,8 +102,8 @@ def measured(folder: Path, patch: Patch) -> int:
                 mask = np.zeros(image.shape[:2], np.uint8)
                 mask[patch.box[1] : patch.box[3], patch.box[0] : patch.box[2]] = 255
                 cv2.imwrite(str(work / "mask.png"), mask)
-        options = ["--mask", str(work / "mask.png"), "--window", "31", "--least", "0.7", "-o", str(work / "out")]
-        told = CliRunner().invoke(main, ["surface", str(folder / patch.calibration), *views, *options])
+        options = ["--mask", work / "mask.png", "--window", 31, "--least", 0.7, "-o", work / "out"]
+        _, told = answer("surface", folder / patch.calibration, *views, *options)
         table = work / "out" / "points_000.csv"
-        print(f"  {' '.join(told.output.split())[:160]}")
+        print(f"  {told[:160]}")
         return len(table.read_text().splitlines()) - 1 if table.exists() else 0

@@ -15,10 +15,10 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from click.testing import CliRunner
 from numpy.typing import NDArray
 
 from benchmarks.accuracy.surfaces.surface_body import cameras, frames_of, moving_arm, record
+from benchmarks.commands import printed
 from benchmarks.figures import amount, figure
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.surfaces.places import nearest
@@ -52,19 +52,12 @@ def counts(
     folder: Path, seed: int, *, frames: int, size: int
 ) -> tuple[tuple[int, int, int, int], list[float]]:
     """Found again without the motion; that could be, that were, that were wrong, with it; and how late, in frames."""
-    from kinefit.cli import main
-
     motion, rig = moving_arm(seed, frames), cameras(size)
     record(folder, motion, rig, seed)
-    surface = ["surface", str(folder / "calib.toml"), *(f"{c.name}={folder / c.name}.avi" for c in rig)]
-    for words in (
-        [*surface, "-o", str(folder / "surface")],
-        ["track", str(folder / "take.toml"), "-o", str(folder / "result")],
-        [*surface, "-o", str(folder / "again"), "--motion", str(folder / "result")],
-    ):
-        told = CliRunner().invoke(main, words)
-        if told.exit_code:
-            raise RuntimeError(told.output)
+    surface = ["surface", folder / "calib.toml", *(f"{c.name}={folder / c.name}.avi" for c in rig)]
+    printed(*surface, "-o", folder / "surface")
+    printed("track", folder / "take.toml", "-o", folder / "result")
+    printed(*surface, "-o", folder / "again", "--motion", folder / "result")
     without = returns(paths_of(folder / "surface" / "trajectories.csv", motion), motion, rig)
     paths = paths_of(folder / "again" / "trajectories.csv", motion)
     late = lateness(folder / "again" / "returns.csv", paths, motion, rig)
@@ -113,12 +106,21 @@ def in_view(
 
 def paths_of(file: Path, motion: Motion) -> NDArray:
     """(F, P, 3) [m] of a table of paths; NaN where a point is not there."""
+    ids, x = read_paths(file, len(motion), motion.rate)
+    out = np.full((len(motion), ids.max() + 1, 3), np.nan)
+    out[:, ids] = x
+    return out
+
+
+def read_paths(file: Path, count: int, rate: float) -> tuple[NDArray, NDArray]:
+    """Points of a table of paths by their ids (P,), and their places (F, P, 3) [m], NaN where a point is not there."""
     with file.open() as lines:
         rows = [[row[name] for name in ("time_s", "point", "x", "y", "z")] for row in csv.DictReader(lines)]
-    table = np.array(rows, float)
-    out = np.full((len(motion), int(table[:, 1].max()) + 1, 3), np.nan)
-    out[np.rint(table[:, 0] * motion.rate).astype(int), table[:, 1].astype(int)] = table[:, 2:]
-    return out
+    table = np.array(rows, float).reshape(-1, 5)
+    ids, column = np.unique(table[:, 1].astype(int), return_inverse=True)
+    x = np.full((count, len(ids), 3), np.nan)
+    x[np.rint(table[:, 0] * rate).astype(int), column] = table[:, 2:]
+    return ids, x
 
 
 def returns(paths: NDArray, motion: Motion, rig: Rig) -> tuple[int, int, int]:

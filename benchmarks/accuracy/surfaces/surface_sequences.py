@@ -16,13 +16,11 @@ from __future__ import annotations
 
 import csv
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from click.testing import CliRunner
 from numpy.typing import NDArray
 
 from benchmarks.accuracy.mixed.mixed_real import take_text
@@ -35,7 +33,10 @@ from benchmarks.accuracy.surfaces.stereo_cylinder import (
     calibration_object,
 )
 from benchmarks.accuracy.surfaces.stereo_cylinder import SIZE as CYLINDER_SIZE
+from benchmarks.accuracy.surfaces.surface_return import read_paths
+from benchmarks.commands import printed
 from benchmarks.figures import amount, data, figure
+from benchmarks.scenes.textured import write_video
 from kinefit.geometry.camera import Rig
 from kinefit.images.photogrammetry.least_squares_matching import Grid, match
 from kinefit.images.photogrammetry.points.bright_points import find_spots
@@ -101,16 +102,6 @@ def run() -> None:
             _spheres(work, place)
 
 
-def _call(*words: object) -> str:
-    """What the command prints; raises RuntimeError if it ends with an error."""
-    from kinefit.cli import main
-
-    told = CliRunner().invoke(main, [str(word) for word in words])
-    if told.exit_code:
-        raise RuntimeError(told.output)
-    return told.output
-
-
 def _report(name: str, right: NDArray, live: NDArray, judged: NDArray) -> None:
     """Figures of places (N,): right, still there at the end, with a reference."""
     counts = {"right": live & judged & right, "said": ~live, "unsaid": live & judged & ~right}
@@ -122,25 +113,6 @@ def _report(name: str, right: NDArray, live: NDArray, judged: NDArray) -> None:
 def _absent(name: str, recording: str) -> None:
     for kind, goal in KINDS.items():
         figure(f"sequence_{name}_{kind}", None, "% of places", goal, f"no recording {recording}")
-
-
-def _write_video(path: Path, images: Sequence[NDArray]) -> None:
-    """Write BGR images (H, W, 3) without loss."""
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), RATE, images[0].shape[1::-1])
-    for image in images:
-        video.write(image)
-    video.release()
-
-
-def _paths(out: Path, count: int) -> tuple[NDArray, NDArray]:
-    """Points by their ids (P,), and their places (F, P, 3) [m], NaN where a path does not exist."""
-    with (out / "trajectories.csv").open() as lines:
-        rows = [[row[name] for name in ("time_s", "point", "x", "y", "z")] for row in csv.DictReader(lines)]
-    table = np.array(rows, float).reshape(-1, 5)
-    ids, column = np.unique(table[:, 1].astype(int), return_inverse=True)
-    x = np.full((count, len(ids), 3), np.nan)
-    x[np.rint(table[:, 0] * RATE).astype(int), column] = table[:, 2:]
-    return ids, x
 
 
 def _in_pixels(x: NDArray) -> NDArray:
@@ -170,11 +142,11 @@ def _challenge(work: Path) -> None:
     files = [folder / f"Sample14 {name}.tif" for name in ("Reference", "L1 Amp0.1b", "L3 Amp0.1b", "L5 Amp0.1b")]
     images = [cv2.imread(str(file))[:588] for file in files]  # the video's format wants even numbers
     order = (0, 1, 2, 3, 2, 1, 0, 3)
-    _write_video(work / "dic.avi", [images[k] for k in order])
+    write_video(work / "dic.avi", [images[k] for k in order], RATE, "FFV1")
     step = amount(12, 40)
-    _call("surface", work / "dic.avi", "--flat", 1, "--window", 21, "--step", step, "-o", work / "dic")
+    printed("surface", work / "dic.avi", "--flat", 1, "--window", 21, "--step", step, "-o", work / "dic")
     places = Grid.of(images[0].shape[1::-1], step, margin=12).points
-    ids, x = _paths(work / "dic", len(order))
+    ids, x = read_paths(work / "dic" / "trajectories.csv", len(order), RATE)
     end = _all(len(places), ids, _in_pixels(x[-1]))
     truth = np.loadtxt(folder / "command.csv", delimiter=",")
     shift = np.interp(places[:, 0], truth[:, 0], truth[:, 5])
@@ -200,11 +172,11 @@ def _cylinder(work: Path) -> None:
     write_calibration(adjusted(rig, objects, start.uv[start.measured]), work / "calib.toml")
     cv2.imwrite(str(work / "mask.png"), mask.astype(np.uint8) * 255)
     for name in CAMERAS:
-        _write_video(work / f"{name}.avi", photographs[name])
+        write_video(work / f"{name}.avi", photographs[name], RATE, "FFV1")
     views = [f"{name}={work / name}.avi" for name in CAMERAS]
     options = ["--mask", work / "mask.png", "--window", WINDOW, "--step", 24, "-o", work / "cylinder"]
-    _call("surface", work / "calib.toml", *views, *options)
-    _, x = _paths(work / "cylinder", 3)
+    printed("surface", work / "calib.toml", *views, *options)
+    _, x = read_paths(work / "cylinder" / "trajectories.csv", 3, RATE)
     begun = np.isfinite(x[0, :, 0])
     first, last = x[0, begun], x[-1, begun]
     live = np.isfinite(last[:, 0])
@@ -236,14 +208,14 @@ def _cloth(work: Path, name: str) -> None:
         _absent(name, cloth.file.split("/")[0])
         return
     size = images[0].shape[1::-1]
-    _write_video(work / "cloth.avi", images)
+    write_video(work / "cloth.avi", images, RATE, "FFV1")
     _mask(work / "mask.png", size, cloth.box)
     options = ["--flat", 1, "--window", SIDE, "--step", step, "--reach", 12, "--mask", work / "mask.png"]
-    _call("surface", work / "cloth.avi", *options, "-o", work / name)
+    printed("surface", work / "cloth.avi", *options, "-o", work / name)
     mask = cv2.imread(str(work / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0
     grid = Grid.of(size, step, margin=SIDE // 2 + 2, mask=mask)
     places = grid.points[grid.inside]
-    ids, x = _paths(work / name, len(images))
+    ids, x = read_paths(work / name / "trajectories.csv", len(images), RATE)
     end = _all(len(places), ids, _in_pixels(x[-1]))
     off = judged(SplineImage.of(images[0][..., ::-1]), SplineImage.of(images[-1][..., ::-1]), places, end)
     _report(name, off <= RIGHT_PX, np.isfinite(end[:, 0]), np.isfinite(off))
@@ -278,19 +250,19 @@ def _help(work: Path) -> None:
         return
     count = amount(40, 6)
     (work / "take.toml").write_text(take_text(folder, "openpose", False, frames=count))
-    _call("track", work / "take.toml", "-o", work / "motion")
+    printed("track", work / "take.toml", "-o", work / "motion")
     with Video(folder / "videos" / f"{camera}.mp4") as video:
         images = [video.read(k)[..., ::-1].copy() for k in range(count)]
-    _write_video(work / "man.avi", images)
+    write_video(work / "man.avi", images, RATE, "FFV1")
     _mask(work / "mask.png", images[0].shape[1::-1], box)
     options = ["--window", SIDE, "--step", 8, "--reach", 12, "--mask", work / "mask.png"]
     calibration = [folder / "Calib_refined_static.toml", f"{camera}={work / 'man.avi'}", "--unit", "m"]
-    _call("surface", *calibration, "--motion", work / "motion", *options, "-o", work / "on")
-    _call("surface", work / "man.avi", "--flat", 1, *options, "-o", work / "off")
+    printed("surface", *calibration, "--motion", work / "motion", *options, "-o", work / "on")
+    printed("surface", work / "man.avi", "--flat", 1, *options, "-o", work / "off")
     for name in ("off", "on"):
-        live = np.isfinite(_paths(work / name, count)[1][..., 0]).sum(axis=1)
+        live = np.isfinite(read_paths(work / name / "trajectories.csv", count, RATE)[1][..., 0]).sum(axis=1)
         print(f"# help {name}: {live[0]} points at first, {live[count // 2]} in the middle, {live[-1]} at the end")
-    ids, x = _paths(work / "on", count)
+    ids, x = read_paths(work / "on" / "trajectories.csv", count, RATE)
     view, splines = read_calibration(folder / "Calib_refined_static.toml", unit="m")[camera], {}
     with (work / "on" / "returns.csv").open() as lines:
         rows = [row for row in csv.DictReader(lines) if row["found_s"]]
@@ -344,14 +316,14 @@ def _spheres(work: Path, name: str) -> None:
         return
     with Video(folder.parent / file) as video:
         images = [video.read(k)[..., ::-1].copy() for k in range(last + 1)]
-    _write_video(work / "spheres.avi", images)
+    write_video(work / "spheres.avi", images, RATE, "FFV1")
     mask, table = np.zeros(images[0].shape[:2], np.uint8), np.array(marks)
     for u, v in np.rint(table[:, :2]).astype(int).tolist():
         cv2.circle(mask, (u, v), 6, 255, -1)
     cv2.imwrite(str(work / "mask.png"), mask)
     options = ["--flat", 1, "--bright", diameter, "--reach", reach, "--mask", work / "mask.png"]
-    _call("surface", work / "spheres.avi", *options, "-o", work / name)
-    uv = _in_pixels(_paths(work / name, len(images))[1])
+    printed("surface", work / "spheres.avi", *options, "-o", work / name)
+    uv = _in_pixels(read_paths(work / name / "trajectories.csv", len(images), RATE)[1])
     gaps = np.linalg.norm(uv[0][None] - table[:, None, :2], axis=2)
     gaps[:, ~np.isfinite(uv[-1, :, 0])] = np.inf
     path, live = np.nan_to_num(gaps, nan=np.inf).argmin(axis=1), np.nan_to_num(gaps, nan=np.inf).min(axis=1) <= 6

@@ -17,16 +17,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
-from click.testing import CliRunner
-from numpy.typing import NDArray
 from tests.exporters.skeletons.character_file import write_character_glb
 
 from benchmarks.accuracy.surfaces.surface_body import frames_of, moving_arm
+from benchmarks.commands import printed
 from benchmarks.figures import amount, figure
 from benchmarks.scenes.bar_scene import draw_bar, wave_bar
-from benchmarks.scenes.textured import textured_picture
+from benchmarks.scenes.textured import textured_picture, write_video
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.fitting.initialization.from_points import clickable
@@ -37,6 +35,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.motion import read_motion
 from kinefit.simulation import squat_and_wave
+from kinefit.simulation.figures import look_at
 from kinefit.simulation.rendering.scenes import SimulatedScene
 
 CLICKS = 2.0  # [px]
@@ -104,14 +103,11 @@ def cameras(setup: Setup) -> Rig:
     out, aim, size = [], np.array(setup.aim), setup.image
     for k, name in enumerate(("left", "middle", "right")):
         place = aim + setup.away + (k - 1) * np.array(setup.apart) + (0.0, 0.1 * (k == 1), 0.0)
-        forward = (aim - place) / np.linalg.norm(aim - place)
-        right = np.cross(forward, [0.0, 1.0, 0.0])
-        right /= np.linalg.norm(right)
-        R = np.stack([right, np.cross(forward, right), forward])
+        T = look_at(place, aim, np.array([0.0, 1.0, 0.0]))
         f = (setup.focal + 0.02 * k) * size
         K = np.array([[f, 0, size / 2 + 3 * k], [0, f, size / 2 - 2 * k], [0, 0, 1]])
         lens = np.array([-0.12 + 0.02 * k, 0.03, 2e-4, -1e-4, 0.0])
-        out.append(Camera(name, (size, size), K, lens, "radtan", se3.transform(R, -R @ place)))
+        out.append(Camera(name, (size, size), K, lens, "radtan", T))
     return Rig(tuple(out))
 
 
@@ -134,17 +130,9 @@ def errors(folder: Path, kind: str, seed: int, *, frames: int, looks: int = 1) -
         ["export", found, "--retarget", take / "character.glb", "-o", take / "moved.glb"],
     ]
     for words in steps if kind == "body" else steps[:-1]:  # an arm alone goes on no character
-        told = CliRunner().invoke(_main(), [str(word) for word in words])
         print(f"  $ kinefit {' '.join(map(str, words))}".replace(f"{folder}/", ""), flush=True)
-        if told.exit_code:
-            raise RuntimeError(f"{words[0]}: {told.output}")
+        printed(*words)
     return compared(read_motion(found), motion, rig, take)
-
-
-def _main():  # type: ignore[no-untyped-def]
-    from kinefit.cli import main
-
-    return main
 
 
 def another(name: str, seed: int, frames: int) -> Motion:
@@ -165,7 +153,7 @@ def record_bar(folder: Path, rig: Rig, setup: Setup, places: int, seed: int) -> 
     ends = np.concatenate([lying, wave_bar(setup.bar, places, low=setup.low, high=setup.high, seed=seed)])
     for c, camera in enumerate(rig):
         images = [draw_bar(camera, at, radius=0.015 * setup.bar, seed=997 * c + f) for f, at in enumerate(ends)]
-        _write_video(folder / f"{camera.name}.avi", camera, 30.0, images)
+        write_video(folder / f"{camera.name}.avi", images, 30.0)
 
 
 def record(folder: Path, motion: Motion, rig: Rig, seed: int) -> None:
@@ -176,14 +164,7 @@ def record(folder: Path, motion: Motion, rig: Rig, seed: int) -> None:
     grain = 2.0 * float(np.linalg.norm(away)) / rig.cameras[1].matrix[0, 0]  # of the middle camera's pixels
     for camera in rig:
         images = [textured_picture(scene, k, camera, grain=grain, seed=seed) for k in range(len(motion))]
-        _write_video(folder / f"{camera.name}.avi", camera, motion.rate, images)
-
-
-def _write_video(path: Path, camera: Camera, rate: float, images: list[NDArray]) -> None:
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), rate, camera.size)
-    for image in images:
-        video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    video.release()
+        write_video(folder / f"{camera.name}.avi", images, motion.rate)
 
 
 def clicks(motion: Motion, rig: Rig, seed: int, steps: Sequence[int] = (0,)) -> str:

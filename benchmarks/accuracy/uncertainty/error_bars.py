@@ -7,16 +7,14 @@ told: the share of the truth inside the stated 95 % interval, for each group of 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from benchmarks.figures import amount, figure
 from benchmarks.scenes.motions import library
-from kinefit import Keypoints, Motion, Recording, load_body, track
+from benchmarks.scenes.simulated import somebody, without
+from kinefit import Motion, Recording, load_body, track
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.simulation.evaluation import ErrorBarCoverage, coverage_of_groups
-from kinefit.solving.bundle.shape import mirror_points
 
 SCENES = {
     "usual": {"outliers": 0.1, "missing": 0.1},
@@ -24,26 +22,6 @@ SCENES = {
     "camera_lost": {"outliers": 0.1, "missing": 0.1},  # one camera, for 30 frames
 }
 ACCURACY = 8.0  # [px] what a take says that tells nothing
-
-
-def person(truth: Motion, keypoint_set: str, random: np.random.Generator) -> Motion:
-    """The motion, of somebody else."""
-    body = truth.body.scaled(random.normal(1.0, 0.05, len(truth.body.scale_groups)))
-    points = body.keypoints(keypoint_set)
-    lead, sign = mirror_points(points, body.tree.segments)
-    shift = random.normal(0.0, 0.008, (len(points), 3))[lead]
-    shift[:, 2] *= sign
-    return replace(truth, body=body.with_keypoints(keypoint_set, points.points + shift))
-
-
-def without(keypoints: list[Keypoints], camera: int, start: int, stop: int) -> list[Keypoints]:
-    """The same with one camera lost for some frames."""
-    record = keypoints[camera]
-    points, confidence = np.array(record.points), np.array(record.confidence)
-    points[start:stop], confidence[start:stop] = np.nan, 0.0
-    out = list(keypoints)
-    out[camera] = replace(record, points=points, confidence=confidence)
-    return out
 
 
 def elbows(truth: Motion, motion: Motion) -> tuple[float, float]:
@@ -63,14 +41,15 @@ def scene(
     told: dict[str, list[tuple[float, float]]] = {}
     for number, truth in enumerate(motions.values()):
         random = np.random.default_rng(number)
-        truth = person(truth, keypoint_set, random)
+        truth = somebody(truth, keypoint_set, random)
         rig = studio_rig(truth)
         seen = simulate_keypoints(
             truth, rig, keypoint_set, noise_px=3.0, drift_px=2.0, drift_time=0.5, seed=number, **SCENES[name]
         )
         if name == "camera_lost":
             middle = len(truth) // 2
-            seen = without(seen, number % len(rig), middle - 15, middle + 15)
+            lost = number % len(rig)
+            seen[lost] = without(seen[lost], slice(middle - 15, middle + 15))
         recording = Recording.of_keypoints(rig, seen, sigma=ACCURACY, up=truth.up)
         motion = track(recording, load_body("humanoid"))
         of_elbows.append(elbows(truth, motion))

@@ -21,7 +21,8 @@ from benchmarks.accuracy.mixed.mixed_runs import MIXES
 from benchmarks.accuracy.mixed.mixed_takes import record, take_text, write
 from benchmarks.accuracy.video.setups import around
 from benchmarks.figures import LEFT_OUT, amount, figure
-from kinefit import Motion, track_take
+from benchmarks.scenes.takes import tracked
+from kinefit import Motion
 from kinefit.exporters.report.angles import ranges_of
 from kinefit.exporters.tables import split_side
 from kinefit.simulation.evaluation import angle_errors
@@ -52,9 +53,7 @@ def of_draw(draw: int) -> dict[str, tuple[list[tuple[str, float, float, float]],
                 around(recording, Path(folder), int(count), draw) if count.isdigit()
                 else take_text(Path(folder), MIXES["markers_alone"])
             )  # fmt: skip
-            path = Path(folder) / f"{setup.replace(' ', '_')}.toml"
-            path.write_text(text)
-            motion = track_take(path)[0]
+            motion = tracked(text)[0]
             out[setup] = errors(recording.truth, motion), bars(recording.truth, motion)
     return out
 

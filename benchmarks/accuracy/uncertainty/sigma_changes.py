@@ -20,7 +20,8 @@ from benchmarks.accuracy.mixed.mixed_takes import marked, record, take_text
 from benchmarks.accuracy.uncertainty.sigma import FRAMES, JOINTS, SETUPS
 from benchmarks.accuracy.video.setups import around
 from benchmarks.figures import LEFT_OUT, amount, figure
-from kinefit import Motion, track_take
+from benchmarks.scenes.takes import tracked
+from kinefit import Motion
 from kinefit.exporters import range_changes
 from kinefit.exporters.c3d_file import write_markers
 
@@ -61,9 +62,7 @@ def of_draw(draw: int) -> dict[str, list[tuple[float, float, float]]]:
                     markers = marked(seen or recording.truth, places, noise)
                     write_markers(markers, Path(folder) / "markers_45.trc")
                     text = take_text(Path(folder), MIXES["markers_alone"])
-                path = Path(folder) / f"{setup.replace(' ', '_')}.toml"
-                path.write_text(text)
-                motions.append(track_take(path)[0])
+                motions.append(tracked(text)[0])
             out[setup] = [
                 (given.get(f"{stem}_{side[0]}", 0.0), *one.change)
                 for stem, side, one in ((*key, one) for key, one in range_changes(*motions).items())

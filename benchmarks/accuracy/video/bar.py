@@ -14,8 +14,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from click.testing import CliRunner
 
+from benchmarks.commands import answer
 from benchmarks.figures import amount, data, figure
 from benchmarks.scenes.bar_scene import (
     CORNERS_LENGTH,
@@ -98,7 +98,6 @@ def _deviations(found: BarCalibration, rig: Rig) -> np.ndarray:
 
 def _drawn() -> None:
     """Images of shining balls with lamps in view through the command."""
-    from kinefit.cli.calibrate import calibrate
     from kinefit.readers.calibration.read import read_calibration
 
     rig, count = bar_rig(3, (1280, 720), seed=200), amount(120, 30)
@@ -110,10 +109,10 @@ def _drawn() -> None:
                 cv2.imwrite(f"{place}/{camera.name}_{f:03d}.png", image)
         out = Path(place) / "result" / "room.toml"
         out.parent.mkdir()
-        told = CliRunner().invoke(calibrate, ["bar", place, "--length", str(_LENGTH), "-o", str(out)])
-        print(told.output)
-        if told.exit_code:
-            figure("bar_drawn_distances", None, "%", "<= 0.1", f"the command failed: {told.exception}")
+        status, told = answer("calibrate", "bar", place, "--length", _LENGTH, "-o", out)
+        print(told)
+        if status:
+            figure("bar_drawn_distances", None, "%", "<= 0.1", f"the command failed: {told}")
             return
         found = read_calibration(out)
         with out.with_suffix(".csv").open() as file:
@@ -129,7 +128,6 @@ def _drawn() -> None:
 
 def _real() -> None:
     """Corners of a real board through the command, against the recording's own calibration of the same images."""
-    from kinefit.cli.calibrate import calibrate
     from kinefit.readers.calibration.read import read_calibration
 
     recording, lengths, angles, why = data("mv4_landmarks_caliscope"), None, None, "the recording is absent"
@@ -137,10 +135,10 @@ def _real() -> None:
         with tempfile.TemporaryDirectory() as place:
             table, out, lenses = Path(place) / "corners.csv", Path(place) / "room.toml", recording / "config.toml"
             write_corners(recording, table)
-            words = ["bar", table, "--length", CORNERS_LENGTH, "--size", "1280x720", "--interiors", lenses, "-o", out]
-            told = CliRunner().invoke(calibrate, [str(word) for word in words])
-            why = f"the command failed: {told.exception}"
-            if not told.exit_code:
+            words = ["--length", CORNERS_LENGTH, "--size", "1280x720", "--interiors", lenses, "-o", out]
+            status, told = answer("calibrate", "bar", table, *words)
+            why = f"the command failed: {told}"
+            if not status:
                 lengths, angles = pose_differences(read_calibration(out), read_calibration(lenses))
     figure("bar_real_lengths", None if lengths is None else 100 * lengths, "%, worst of six", "<= 0.3", why)
     figure("bar_real_angles", angles, "deg, worst of six", "<= 0.2", why)

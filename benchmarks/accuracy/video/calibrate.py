@@ -7,8 +7,8 @@ was given, tell how good the result is. On recorded motions projected into four 
 from __future__ import annotations
 
 import tempfile
-import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from benchmarks.accuracy.video.tracking import (
 from benchmarks.figures import amount, each, figure, whole_recording
 from benchmarks.scenes.balancing import TRIAL
 from benchmarks.scenes.motions import library
+from benchmarks.timing import took
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, track
 from kinefit.geometry import se3
 from kinefit.geometry.lines import triangulate
@@ -73,9 +74,7 @@ def real_trial(folder: Path, where: Path) -> None:
         trial = read_trial(folder, detector, where)
         goal = f"<= {RESIDUAL[detector]:g}"
         before = track(Recording.of_keypoints(shipped, trial.keypoints), body)
-        began = time.process_time()
-        found = refine(shipped, trial.keypoints, body)
-        seconds = time.process_time() - began
+        found, seconds = took(partial(refine, shipped, trial.keypoints, body))
         for line in found.summary_lines():
             print(f"# {detector}: {line}")
         after = track(Recording.of_keypoints(found.rig, trial.keypoints), body)

@@ -14,14 +14,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.uncertainty.error_bars import ACCURACY, person
+from benchmarks.accuracy.uncertainty.error_bars import ACCURACY
 from benchmarks.accuracy.video.posture_takes import Take, learnt, shown, takes, uncoupled
 from benchmarks.figures import figure
+from benchmarks.scenes.simulated import somebody, with_points_off
 from kinefit import Body, Motion, Recording, load_body, track
 from kinefit.geometry import se3
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.simulation.evaluation import angle_errors
-from kinefit.solving.bundle.shape import mirror_points
 
 SET = "BODY_25B"
 ANGLES = {"hip flexion": ("hip_flexion_r", "hip_flexion_l"), "lumbar extension": ("lumbar_extension",),
@@ -47,12 +47,9 @@ def seen_by_detector(take: Take, number: int) -> Motion:
     """The take of a person whose detector points stand beside the anatomical ones."""
     random, truth = np.random.default_rng(number), shown(take)
     if not take.marked:
-        return person(truth, SET, random)
-    points = truth.body.keypoints(SET)  # lengths are the person's own
-    lead, sign = mirror_points(points, truth.body.tree.segments)
-    shift = random.normal(0.0, 0.008, (len(points), 3))[lead]
-    shift[:, 2] *= sign
-    return replace(truth, body=truth.body.with_keypoints(SET, points.points + shift))
+        return somebody(truth, SET, random)
+    off = random.normal(0.0, 0.008, (len(truth.body.keypoints(SET)), 3))  # lengths are the person's own
+    return replace(truth, body=with_points_off(truth.body, SET, off))
 
 
 def told(truth: Motion, number: int, body: Body) -> Told:

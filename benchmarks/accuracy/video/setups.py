@@ -18,12 +18,11 @@ import numpy as np
 from benchmarks.accuracy.mixed.mixed_runs import MIXES
 from benchmarks.accuracy.mixed.mixed_takes import RATE, Recording, detected, record, take_text, write
 from benchmarks.figures import LEFT_OUT, amount, figure
-from kinefit import Motion, track_take
-from kinefit.geometry import se3
-from kinefit.geometry.camera import Rig
-from kinefit.readers.calibration.read import write_calibration
+from benchmarks.scenes.simulated import calibrated, write_cameras
+from benchmarks.scenes.takes import tracked
+from kinefit import Motion
 from kinefit.simulation import studio_rig
-from kinefit.simulation.evaluation import angle_errors
+from kinefit.simulation.evaluation import angle_errors, joint_errors
 
 FIRST, DRAWS, SURE = 7000, 8, 10.0  # [degrees]
 AGAIN = 100_000  # added to the draw whose noise a second take has
@@ -43,9 +42,7 @@ def run() -> None:
             runs = {f"{n} cameras": around(recording, Path(folder), n, draw) for n in amount(CAMERAS, CAMERAS[:2])}
             runs |= {mix: take_text(Path(folder), MIXES[mix]) for mix in amount(SENSORS, SENSORS[-1:])}
             for name, text in runs.items():
-                path = Path(folder) / f"{name.replace(' ', '_')}.toml"
-                path.write_text(text)
-                mm, degrees = off(recording, track_take(path)[0])
+                mm, degrees = off(recording, tracked(text)[0])
                 joints.setdefault(name, []).append(mm)
                 angles.setdefault(name, []).append(degrees)
                 print(f"draw {draw}, {name}: {mm:.1f} mm, {degrees:.1f} degrees", flush=True)
@@ -66,25 +63,14 @@ def around(recording: Recording, folder: Path, cameras: int, draw: int, seen: Mo
     """
     random = np.random.default_rng([31, draw, cameras])
     rig = studio_rig(recording.truth, cameras=cameras)
-    told = Rig(tuple(
-        c.with_pose(se3.transform(se3.exp_so3(random.normal(0, np.radians(0.1), 3)), random.normal(0, 0.003, 3))
-                    @ c.T_camera_world) for c in rig
-    ))  # fmt: skip
-    write_calibration(told, folder / f"calibration_{cameras}.toml")
-    text = f'[take]\nrate = {RATE}\nup = "y"\n[calibration]\nfile = "{folder}/calibration_{cameras}.toml"\n'
     points = detected(seen or recording.truth, rig, draw + AGAIN * (seen is not None), cameras=rig.names)
-    for name, own in zip(rig.names, points):
-        np.save(folder / f"{cameras}_{name}.npy", own)
-        text += f'[[camera]]\nname = "{name}"\n[[keypoints]]\ncamera = "{name}"\nformat = "mediapipe"\n'
-        text += f'file = "{folder}/{cameras}_{name}.npy"\nrate = {RATE}\n'
-    return text
+    return write_cameras(folder, calibrated(rig, random), points, RATE, f"{cameras}_")
 
 
 def off(recording: Recording, motion) -> tuple[float, float]:
     """[mm], [degrees] of the joints and sure angles of a motion from the truth."""
     truth = recording.truth
-    turn = np.abs(angle_errors(truth, motion))
+    turn, away = np.abs(angle_errors(truth, motion)), joint_errors(truth, motion)
     motion = motion if motion.up == truth.up else motion.turned(truth.up)
-    away = np.linalg.norm(motion.segment_poses()[..., :3, 3] - truth.segment_poses()[..., :3, 3], axis=-1)
     sure = np.degrees(motion.dof_std[:, 6:]) < SURE
     return 1e3 * float(away.mean()), float(turn[sure].mean()) if sure.any() else np.nan

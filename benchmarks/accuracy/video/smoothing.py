@@ -19,15 +19,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.video.tracking import NOISE, median_residual, read_trial
+from benchmarks.accuracy.video.tracking import library_tracked, median_residual, read_trial
 from benchmarks.figures import amount, each, figure, recording
 from benchmarks.scenes.balancing import TRIAL
-from benchmarks.scenes.motions import library
-from kinefit import Motion, Recording, load_body, read_markers, track
+from kinefit import Motion, load_body, read_markers, track
 from kinefit.bodies import PointSet
 from kinefit.geometry.losses import geman_mcclure
-from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
-from kinefit.simulation.evaluation import angle_errors, joint_errors
+from kinefit.simulation import cut, squat_and_wave, studio_rig
 from kinefit.solving.trajectory.motion_prior import MotionPrior
 from kinefit.solving.trajectory.sequence import SeenPoints
 from kinefit.solving.trajectory.smoothing import smooth
@@ -78,15 +76,9 @@ def real_trial(folder: Path) -> None:
 def synthetic(keypoint_set: str) -> None:
     """Joint centres, angles and peak speeds of recorded motions."""
     joints, angles, sure, peaks = [], [], [], []
-    for name, truth in library().items():
-        rig = studio_rig(truth)
-        keypoints = simulate_keypoints(truth, rig, keypoint_set, seed=len(joints), **NOISE)
-        recording = Recording.of_keypoints(rig, keypoints, sigma=NOISE["noise_px"], up="y")
-        motion = track(recording, load_body("humanoid"))
-        turns = np.where(np.isfinite(motion.dof_std[:, 6:]), np.abs(angle_errors(truth, motion)), np.nan)
-        joints.append(1e3 * float(joint_errors(truth, motion).mean()))
-        angles.append(float(np.nanmean(turns)))
-        sure.append(float(np.nanmean(turns[motion.dof_std[:, 6:] < np.radians(10)])))
+    for name, truth, motion, errors in library_tracked(keypoint_set):
+        for of, error in zip((joints, angles, sure), errors):
+            of.append(error)
         peaks.append(np.median(peak_speeds(motion) / peak_speeds(truth)))
         print(
             f"# {keypoint_set} {name}: {joints[-1]:.1f} mm, {angles[-1]:.2f} deg, of angles surer than 10 deg "

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from benchmarks.figures import LEFT_OUT, NotMeasured, amount, each, figure, quic
 from benchmarks.scenes.balancing import TRIAL, trial_text
 from benchmarks.scenes.held_out import sides_right
 from benchmarks.scenes.motions import library
+from benchmarks.timing import took
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, load_observations, read_take, track
 from kinefit.geometry.lines import triangulate_robust
 from kinefit.simulation import simulate_keypoints, studio_rig
@@ -96,9 +98,7 @@ def free_points_held_out(trial: Trial, whole: Motion) -> float:
 
 def wall(trial: Trial, *, smooth: bool) -> float:
     """Seconds from keypoints to motion, once the kernels are there."""
-    began = time.perf_counter()
-    track(trial.recording, load_body("humanoid"), smooth=smooth)
-    return time.perf_counter() - began
+    return took(lambda: track(trial.recording, load_body("humanoid"), smooth=smooth), clock=time.perf_counter)[1]
 
 
 def middle(errors: NDArray) -> float:
@@ -167,19 +167,28 @@ def start_up(take: Path, where: Path) -> None:
     figure("video_later_start", min(t["first frame"] for t in told[1:]), "s", "<= 3")
 
 
+def library_tracked(
+    keypoint_set: str, *, smooth: bool = True
+) -> Iterator[tuple[str, Motion, Motion, tuple[float, float, float]]]:
+    """Each recorded motion: its name, the truth, what keypoints of four cameras with noise, outliers and gaps give, and
+    mean errors of joints [mm], of angles, and of those with a standard deviation below 10 degrees [deg].
+    """
+    for number, (name, truth) in enumerate(library().items()):
+        rig = studio_rig(truth)
+        keypoints = simulate_keypoints(truth, rig, keypoint_set, seed=number, **NOISE)
+        recording = Recording.of_keypoints(rig, keypoints, sigma=NOISE["noise_px"], up="y")
+        motion = track(recording, load_body("humanoid"), smooth=smooth)
+        turns = np.where(np.isfinite(motion.dof_std[:, 6:]), np.abs(angle_errors(truth, motion)), np.nan)
+        sure = float(np.nanmean(turns[motion.dof_std[:, 6:] < np.radians(10)]))
+        yield name, truth, motion, (1e3 * float(joint_errors(truth, motion).mean()), float(np.nanmean(turns)), sure)
+
+
 def synthetic(keypoint_set: str) -> None:
     """Joint centres and angles of twenty recorded motions, from keypoints with noise, outliers and gaps."""
     joints, angles, sure, inside = [], [], [], []
-    for name, truth in library().items():
-        rig = studio_rig(truth)
-        keypoints = simulate_keypoints(truth, rig, keypoint_set, seed=len(joints), **NOISE)
-        recording = Recording.of_keypoints(rig, keypoints, sigma=NOISE["noise_px"], up="y")
-        motion = track(recording, load_body("humanoid"), smooth=False)
-        observed = np.isfinite(motion.dof_std[:, 6:])
-        turns = np.where(observed, np.abs(angle_errors(truth, motion)), np.nan)
-        sure.append(float(np.nanmean(turns[motion.dof_std[:, 6:] < np.radians(10)])))
-        joints.append(1e3 * float(joint_errors(truth, motion).mean()))
-        angles.append(float(np.nanmean(turns)))
+    for name, truth, motion, errors in library_tracked(keypoint_set, smooth=False):
+        for of, error in zip((joints, angles, sure), errors):
+            of.append(error)
         inside.append(coverage(truth, motion))
         print(
             f"# {keypoint_set} {name}: {joints[-1]:.1f} mm, {angles[-1]:.2f} deg, within 2 sigma: "

@@ -11,7 +11,6 @@ import os
 
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
-import time
 from collections.abc import Callable
 from functools import partial
 
@@ -19,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
-from benchmarks.scenes.marker_takes import STANFORD, load, shuffled
+from benchmarks.scenes.marker_takes import STANFORD, counts, load, shuffled
+from benchmarks.timing import timed
 from kinefit.bodies.marker_sets import find_marker_set
 from kinefit.markers.frame.identify import identify
 from kinefit.markers.model.from_frame import model_from_frame
@@ -61,15 +61,13 @@ def ours(model: MarkerModel, points: NDArray) -> NDArray:
 
 def score(method: Identifier, model: MarkerModel, take: Markers, missing: float, extra: int) -> tuple[float, ...]:
     """Right and wrong [%], seconds of a frame (median), over frames spread over a take."""
-    rng, right, wrong, seen, times = np.random.default_rng(0), 0, 0, 0, []
+    rng, counted, times = np.random.default_rng(0), np.zeros(3, int), []
     for f in np.unique(np.linspace(0, len(take) - 1, FRAMES).round().astype(int)):
         points, truth = shuffled(take, model.labels, int(f), rng, missing, extra)
-        start = time.process_time()
-        found = method(model, points)
-        times.append(time.process_time() - start)
-        right += int(((found == truth) & (truth >= 0)).sum())
-        wrong += int(((found != truth) & (found >= 0)).sum())
-        seen += int((truth >= 0).sum())
+        with timed(times):
+            found = method(model, points)
+        counted += counts(found, truth)
+    right, wrong, seen = counted.tolist()
     return 100 * right / seen, 100 * wrong / seen, float(np.median(times))
 
 

@@ -11,7 +11,6 @@ import os
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +21,8 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure, quick
 from benchmarks.papers.markers.synthetic_points import random_pose, synthetic_body
+from benchmarks.scenes.marker_takes import counts
+from benchmarks.timing import timed
 from kinefit.markers.frame.identify import identify
 from kinefit.markers.model.model import MarkerModel
 from kinefit.papers.sapm import sapm
@@ -50,18 +51,14 @@ def ours(model: MarkerModel, points: NDArray) -> NDArray:
 def score(method: Identifier, model: MarkerModel, poses: int, seed: int = 1, **kind: float) -> Score:
     """A method over random poses of one kind."""
     rng = np.random.default_rng(seed)
-    whole = right = wrong = seen = 0
-    times = []
+    whole, counted, times = 0, np.zeros(3, int), []
     for _ in range(poses):
         pose = random_pose(model, rng, **kind)
-        start = time.process_time()
-        found = method(model, pose.points)
-        times.append(1e3 * (time.process_time() - start))
-        good = found == pose.truth
-        whole += bool(good.all())
-        right += int((good & (pose.truth >= 0)).sum())
-        wrong += int((~good & (found >= 0)).sum())
-        seen += int((pose.truth >= 0).sum())
+        with timed(times, 1e3):
+            found = method(model, pose.points)
+        whole += bool((found == pose.truth).all())
+        counted += counts(found, pose.truth)
+    right, wrong, seen = counted.tolist()
     return Score(whole / poses, right / seen, wrong / (poses * len(model)), float(np.median(times)), max(times))
 
 

@@ -57,13 +57,12 @@ class SyntheticPose:
     truth: NDArray
 
 
-def synthetic_body(points: int = 44, *, placing: float = PLACING, seed: int = 0) -> MarkerModel:
+def synthetic_body(points: int = 44) -> MarkerModel:
     """The paper's body of 13 segments and 44 points, or of 15 segments (with hands) and 49 points.
 
     Parameters
     ----------
     points : 44 or 49
-    placing : [m] standard deviation of left and right markers from mirror symmetry
     """
     tree = [row for row in TREE if points > 44 or not row[0].startswith("hand")]
     full: list[tuple[str, str, str, list[str]]] = []  # name, parent, joint (empty for the root), markers
@@ -75,9 +74,9 @@ def synthetic_body(points: int = 44, *, placing: float = PLACING, seed: int = 0)
         full[2][3].append("l_asis")
     labels = tuple(dict.fromkeys(m for *_, markers in full for m in markers))
     joints = {joint for _, _, joint, _ in full}
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     at = np.array([PLACES[m] if m in PLACES else np.multiply(PLACES["r" + m[1:]], (1, 1, -1)) for m in labels])
-    at += placing * rng.standard_normal(at.shape) * np.array([m not in joints for m in labels])[:, None]
+    at += PLACING * rng.standard_normal(at.shape) * np.array([m not in joints for m in labels])[:, None]
     names = [name for name, *_ in full]
     segments = tuple(
         SetSegment(name, names.index(parent), tuple(markers), at[labels.index(joint)])

@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from benchmarks.scenes.regions_scene import face_normals
 from kinefit.bodies.rendering import Canvas, Raster, scaled
 from kinefit.bodies.surfaces import BodyMesh
 from kinefit.geometry.camera import Camera, Rig
@@ -174,12 +175,10 @@ def _coloured(
 ) -> tuple[NDArray, NDArray]:  # fmt: skip
     """Colours (h, w, 3) and light of the lamp (h, w) in 0..1 of the pixels seen of a thing."""
     mesh, lamp = thing.mesh, _lamp(light, middle)
-    corners = x[mesh.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
+    towards = face_normals(x, mesh.faces) @ light.towards
     colour, lit = np.zeros((*seen.shape, 3), np.float32), np.zeros(seen.shape, np.float32)
     _shade(
-        seen, raster.depth, raster.face, camera.ray_table, camera.T_camera_world, normals @ light.towards,
+        seen, raster.depth, raster.face, camera.ray_table, camera.T_camera_world, towards,
         mesh.face_segment, frames, thing.paint, thing.contrast, grain_table(), GRAIN, lamp.T_camera_world,
         lamp.matrix[0, 0], lamp.matrix[0, 2], sun, colour, lit,
     )  # fmt: skip

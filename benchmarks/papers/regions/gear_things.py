@@ -28,7 +28,10 @@ _BODY = {
 }  # fmt: skip
 
 
-def dressed(motion: Motion, random: np.random.Generator, *, bare: float = 0.12) -> Thing:
+_GRAINED = 0.12  # contrast of the grain of skin and cloth
+
+
+def dressed(motion: Motion, random: np.random.Generator) -> Thing:
     """A person, and gear in black and grey: skin, shirt, trousers and shoes of colours drawn at random."""
     body = motion.body
     skin = np.array([0.75, 0.53, 0.42]) * random.uniform(0.6, 1.1)
@@ -39,7 +42,7 @@ def dressed(motion: Motion, random: np.random.Generator, *, bare: float = 0.12) 
     names = [name.removesuffix("_r").removesuffix("_l") for name in body.tree.segments]
     paint = np.array([(0.2, 0.2, 0.22) if g else worn[_BODY[n]] for n, g in zip(names, gear)])
     frames = np.stack([body.tree.forward(T, a)[0] for T, a in zip(motion.Ts_world_root, motion.angles)])
-    return Thing(body_mesh(body), paint, bare, frames)
+    return Thing(body_mesh(body), paint, _GRAINED, frames)
 
 
 def together(*things: Thing) -> Thing:

@@ -169,6 +169,14 @@ def drawn(motion: Motion, frame: int, camera: Camera) -> NDArray:
     return np.array(render_body(motion.body, motion.state(frame), camera, mesh=body_mesh(motion.body)).seen)
 
 
+def outlined(f: Followed, frame: int, camera: Camera, width: int) -> NDArray:
+    """An image (H, W, 3) BGR with the contour of the tracked body, so many pixels wide."""
+    image = next(iter(f.take.scene.images(camera, [frame])))
+    seen = drawn(f.closed, frame, camera).astype(np.uint8)
+    lines, _ = cv2.findContours(seen, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return np.asarray(cv2.drawContours(np.ascontiguousarray(image[..., ::-1]), lines, -1, (0, 255, 255), width))
+
+
 def picture(whole: Followed, hidden: Followed) -> None:
     """Images of two cameras with the outline of the tracked body, for the docs."""
     rows = []
@@ -176,11 +184,7 @@ def picture(whole: Followed, hidden: Followed) -> None:
         frame = 3 * len(f.take.scene) // 4
         row = []
         for camera in list(f.take.scene.rig)[:3]:
-            image = next(iter(f.take.scene.images(camera, [frame])))
-            found, _ = cv2.findContours(
-                drawn(f.closed, frame, camera).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
-            )
-            row.append(cv2.drawContours(np.ascontiguousarray(image[..., ::-1]), found, -1, (0, 255, 255), 2))
+            row.append(outlined(f, frame, camera, 2))
         rows.append(np.hstack(row))
     shown = cv2.resize(np.vstack(rows), None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(IMAGES / f"regions_{whole.take.name}.jpg"), shown, [cv2.IMWRITE_JPEG_QUALITY, 82])

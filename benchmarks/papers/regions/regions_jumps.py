@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from benchmarks.accuracy.closures.closures_people import gap, left, own_circle, rms
 from benchmarks.figures import LEFT_OUT, NotMeasured, amount, figure, quick
 from benchmarks.papers.regions.gear_takes import GearTake, rendered_cyclist, rendered_snowboarder
-from benchmarks.papers.regions.regions_gear import IMAGES, TRACKED, Followed, drawn, followed
+from benchmarks.papers.regions.regions_gear import IMAGES, TRACKED, Followed, followed, outlined
 from kinefit.geometry import se3
 from kinefit.takes.track import track_take
 
@@ -52,9 +52,9 @@ def cyclist(seed: int, cameras: int, *, seconds: float = SECONDS, size: float = 
     )
 
 
-def jump(seed: int, cameras: int, *, seconds: float = JUMP_S, size: float = SIZE) -> GearTake:
+def jump(seed: int, cameras: int) -> GearTake:
     """The snowboarder's jump with the turn in it."""
-    return rendered_snowboarder(seed, seconds=seconds, cameras=cameras, rate=RATE, size=size, about_jump=True)
+    return rendered_snowboarder(seed, seconds=JUMP_S, cameras=cameras, rate=RATE, size=SIZE, about_jump=True)
 
 
 def riser(seed: int, cameras: int, *, seconds: float = SECONDS, size: float = SIZE) -> GearTake:
@@ -128,13 +128,5 @@ def picture(f: Followed, name: str, shares: Sequence[float]) -> None:
     """Images of two cameras at some parts of the take, with the contour of the tracked body."""
     rows = []
     for camera in list(f.take.scene.rig)[:2]:
-        row = []
-        for share in shares:
-            frame = int(share * (len(f.take.scene) - 1))
-            image = next(iter(f.take.scene.images(camera, [frame])))
-            lines, _ = cv2.findContours(
-                drawn(f.closed, frame, camera).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
-            )
-            row.append(cv2.drawContours(np.ascontiguousarray(image[..., ::-1]), lines, -1, (0, 255, 255), 1))
-        rows.append(np.hstack(row))
+        rows.append(np.hstack([outlined(f, int(share * (len(f.take.scene) - 1)), camera, 1) for share in shares]))
     cv2.imwrite(str(IMAGES / f"{name}.jpg"), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 82])

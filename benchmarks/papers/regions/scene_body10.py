@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.timing import timed
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.bodies.surfaces import MeshSurface
 from kinefit.bodies.surfaces.mesh import BodyMesh, read_obj
@@ -240,26 +241,24 @@ class Run:
 
 def run_scene(
     scene: Scene, tracker: Callable[[Body, Rig, float], Any], *, every: int = 1, frames: Iterable[int] | None = None,
-    first: BodyState | None = None, kinds: Sequence[str] = ("depth",),
+    kinds: Sequence[str] = ("depth",),
 ) -> Run:  # fmt: skip
-    """Follow a scene from its truth (or `first`) on, every few frames.
+    """Follow a scene from its truth on, every few frames.
 
     Parameters
     ----------
     tracker : (body, rig, rate) -> an object with `start_at(state)` and `update(frames)`.
     kinds : of sensors, "depth", "region" or both
     """
-    from time import process_time
 
     chosen = list(range(0, len(scene), every) if frames is None else frames)
     made = tracker(scene.body, scene.rig, RATE / every)
-    made.start_at(scene.states[chosen[0]] if first is None else first)
+    made.start_at(scene.states[chosen[0]])
     add, ms, results = [], [], []
     for i in chosen:
         frames_at = scene.seen(i, kinds)
-        begin = process_time()
-        result = made.update(frames_at(i / RATE))
-        ms.append(1e3 * (process_time() - begin))
+        with timed(ms, 1e3):
+            result = made.update(frames_at(i / RATE))
         add.append(scene.add(result.state, i))
         results.append(result)
     lost = np.array([r.lost for r in results])

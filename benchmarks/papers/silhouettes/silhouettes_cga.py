@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.figures import figure
+from benchmarks.timing import fastest
 from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface, conformal
 from kinefit.geometry import cga, lines, se3
 from kinefit.geometry.cga import e, exp, point, twist, versor
@@ -50,9 +51,4 @@ def run() -> None:
 def least_ms(work: Callable[[], object]) -> float:
     """Least wall time [ms] of many calls, after one to compile."""
     work()
-    best = np.inf
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        work()
-        best = min(best, time.perf_counter() - start)
-    return 1e3 * best
+    return 1e3 * fastest(work, REPEATS, clock=time.perf_counter)[1]

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure, recording
+from benchmarks.scenes.takes import start_text
 from kinefit.bodies.surfaces.fourier import FourierCurve
 from kinefit.errors import ObservationError
 from kinefit.geometry import se3
@@ -222,12 +223,11 @@ class Command:
             (folder / "masks").mkdir()
             cv2.imwrite(str(folder / "masks" / "0.png"), mask)
             name, (width, height) = self.camera.name, self.camera.size
-            out = []
+            out, low = [], f"low_pass = {str(low_pass).lower()}\n"
             for T in starts:
-                at, forward, upward = T[:3, 3].tolist(), T[:3, 0].tolist(), T[:3, 1].tolist()
                 (folder / "take.toml").write_text(
-                    f'[take]\nrate = 30.0\nup = "-y"\nbody = "sheet.toml"\nsize = false\n[start]\nat = {at}\n'
-                    f'forward = {forward}\nupward = {upward}\nlow_pass = {str(low_pass).lower()}\n'
+                    f'[take]\nrate = 30.0\nup = "-y"\nbody = "sheet.toml"\nsize = false\n'
+                    f"{start_text(T, more=low)}"
                     '[calibration]\nfile = "rig.toml"\nunit = "m"\n'
                     f'[[camera]]\nname = "{name}"\nsize = [{width}, {height}]\n'
                     f'[[silhouette]]\ncamera = "{name}"\nfile = "masks"\nrate = 30.0\nsigma = 1.0\n'

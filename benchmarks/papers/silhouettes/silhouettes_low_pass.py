@@ -18,8 +18,8 @@ from benchmarks.accuracy.images.silhouettes_track import FRAMES, take_text
 from benchmarks.figures import amount, data, figure
 from benchmarks.papers.silhouettes.silhouettes_cat import take_by_silhouettes
 from benchmarks.papers.silhouettes.silhouettes_contour import off_by
-from benchmarks.scenes.balancing import tracked
 from benchmarks.scenes.regions_scene import away
+from benchmarks.scenes.takes import start_text, tracked
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.serial import save_body
 from kinefit.takes.track import track_take
@@ -78,16 +78,13 @@ def _found(folder: Path, motion: Motion, i: int, angles: NDArray, line: str) -> 
     """[m] by which the landmarks of a step are off on average, from a start with these angles [rad]."""
     body, tree, T = motion.body, motion.body.tree, motion.Ts_world_root[i]
     degrees = np.degrees(np.clip(angles, tree.lower, tree.upper))
-    listed = ", ".join(f"{name} = {value:.4f}" for name, value in zip(tree.coordinates, degrees))
-    start = f"[start]\nat = {T[:3, 3].tolist()}\nforward = {T[:3, 0].tolist()}\nupward = {T[:3, 1].tolist()}\n"
+    start = start_text(T, dict(zip(tree.coordinates, degrees)), line)
     text = take_text(folder, "masks").replace("height = 1.75\n", "size = false\n")
     text = re.sub(r"\[\[keypoints\]\]\n(.+ = .+\n)+", "", text)
     with tempfile.TemporaryDirectory() as work:
         save_body(body, Path(work) / "body.npz")
-        text = text.replace("[take]\n", '[take]\nbody = "body.npz"\n', 1)
+        text = text.replace("[take]\n", f'[take]\nbody = "{work}/body.npz"\n', 1)
         text = text.replace(f"frames = [0, {FRAMES}]", f"frames = [{i}, {i + 1}]", 1)
-        text = text.replace("[calibration]\n", f"{start}{line}angles = {{ {listed} }}\n[calibration]\n", 1)
-        (Path(work) / "take.toml").write_text(text)
-        found = track_take(Path(work) / "take.toml")[0].state(0)
+        found = tracked(text.replace("[calibration]\n", f"{start}[calibration]\n", 1))[0].state(0)
     gap = body.positions(found, body.landmarks) - body.positions(motion.state(i), body.landmarks)
     return float(np.linalg.norm(gap, axis=1).mean())

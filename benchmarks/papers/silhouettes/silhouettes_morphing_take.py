@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure
 from benchmarks.papers.silhouettes.silhouettes_morphing import FRAMES, JOINTS, cameras, sequence
 from benchmarks.papers.silhouettes.silhouettes_shoulders import stiff
+from benchmarks.scenes.takes import start_text
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.rendering import Canvas
@@ -29,10 +30,9 @@ def take_of_masks(folder: Path, drawn: Body, views: list[Camera], states: list[B
     """A take of masks of all views, drawn at twice the size; `head` stands in [take], the first pose in [start]."""
     write_calibration(Rig(tuple(views)), folder / "rig.toml")
     model, start = Morphing(drawn), states[0]
-    listed = ", ".join(f"{name} = {np.degrees(q):.4f}" for name, q in zip(drawn.tree.coordinates, start.angles))
-    text = f'[take]\nrate = 30.0\nup = "y"\n{head}\n[start]\nat = {start.T_world_root[:3, 3].tolist()}\n'
-    text += f"forward = {start.T_world_root[:3, 0].tolist()}\nupward = {start.T_world_root[:3, 1].tolist()}\n"
-    text += f'angles = {{ {listed} }}\n[calibration]\nfile = "rig.toml"\nunit = "m"\n'
+    degrees = dict(zip(drawn.tree.coordinates, np.degrees(start.angles)))
+    text = f'[take]\nrate = 30.0\nup = "y"\n{head}\n{start_text(start.T_world_root, degrees)}'
+    text += '[calibration]\nfile = "rig.toml"\nunit = "m"\n'
     for camera in views:
         (folder / camera.name).mkdir(exist_ok=True)
         width, height = camera.size

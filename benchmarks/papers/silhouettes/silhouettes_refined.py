@@ -19,8 +19,9 @@ from benchmarks.accuracy.images.silhouettes_anny import STEPS, follow, overlaps
 from benchmarks.accuracy.images.silhouettes_track import FRAMES, take_text
 from benchmarks.figures import NotMeasured, amount, data, figure
 from benchmarks.papers.silhouettes.silhouettes_shoulders import HELD, Shoulders, gain, shoulders, tracked
-from benchmarks.scenes.balancing import CAMERAS, seen_of
+from benchmarks.scenes.balancing import CAMERAS
 from benchmarks.scenes.silhouettes_scene import shape_from_silhouettes
+from benchmarks.scenes.takes import seen_of
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.morphs.anny import AnnyModel, load_anny
 from kinefit.bodies.motion import Motion

@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy.images.silhouettes_track import take_text
 from benchmarks.figures import amount, figure, quick, recording
-from benchmarks.scenes.balancing import CAMERAS, seen_of
+from benchmarks.scenes import takes
+from benchmarks.scenes.balancing import CAMERAS
 from kinefit.bodies import BodyState
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.motion import Motion
 from kinefit.bodies.rendering import Canvas, scaled
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SilhouetteVideo
-from kinefit.takes.track import track_take
 
 SCALE = 0.5  # at which the body and masks are compared
 AROUND = 0.2  # [m] of a shoulder joint
@@ -52,8 +52,7 @@ def tracked(text: str, body: str) -> Motion:
             body = str(work / "body.toml")
         if quick():  # the fit of the person takes most of the time
             text = text.replace("height = 1.75", "size = false")
-        (work / "take.toml").write_text(text.replace("[take]\n", f'[take]\nbody = "{body}"\n', 1))
-        return track_take(work / "take.toml")[0]
+        return takes.tracked(text.replace("[take]\n", f'[take]\nbody = "{body}"\n', 1))[0]
 
 
 def stiff(name: str = "humanoid_morphing") -> str:
@@ -100,7 +99,7 @@ def run() -> None:
     """Print the figures."""
     folder = recording("video_balancing_4cam")
     names = "morphing_real_overlap_gain", "morphing_real_outline_gain", "morphing_real_raised_gain"
-    seen = seen_of(take_text(folder, "masks"))
+    seen = takes.seen_of(take_text(folder, "masks"))
     assert seen.rig is not None
     found: dict[str, list[Shoulders]] = {"morphing": [], "stiff": []}
     for k, camera in enumerate(CAMERAS):

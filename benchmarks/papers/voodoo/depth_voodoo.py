@@ -12,12 +12,13 @@ tracker frame by frame. The Kinect-like sensor: twenty sequences.
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from benchmarks.figures import amount, figure, quick
+from benchmarks.timing import took
 from kinefit.bodies import Body, BodyState, TaperedCylinder
 from kinefit.bodies.motion import Motion
 from kinefit.papers.voodoo import Settings
@@ -80,9 +81,7 @@ def run() -> None:
         print(f"#   {name}: {found.counts}, mean {found.mean_grade:.2f}, joints {1e3 * found.error:.0f} mm", flush=True)
     runs = list(sequences(amount(100, 1), seed=HELD_OUT, rate=RATE))
     for name, method in METHODS.items():
-        began = time.process_time()
-        summaries = evaluate(runs, method)
-        spent = (time.process_time() - began) / 60.0
+        summaries, seconds = took(partial(evaluate, runs, method))
         for inputs, summary in summaries.items():
             for of, part in (("", summary), (", the six named movements", summary.named)):
                 if not part.graded:
@@ -97,7 +96,7 @@ def run() -> None:
         figure(f"{name}_lost", both.counts[0], "of the sequences", "<= 5" if published else "== 0")
         figure(f"{name}_grade", both.mean_grade, "of 2", ">= 1.58" if published else ">= 1.95")
         figure(f"{name}_conclusions", float(sum(holds.values())), "of 3", "== 3")
-        figure(f"{name}_minutes", spent, "min CPU for all three choices of sensors", "<= 10")
+        figure(f"{name}_minutes", seconds / 60.0, "min CPU for all three choices of sensors", "<= 10")
         if not published:
             figure(f"{name}_tof_mm", 1e3 * both.error, "mm, mean of all joints", "<= 25")
     kinect = sequences(KINECT_COUNT, sensor=KINECT, seed=HELD_OUT, rate=RATE)

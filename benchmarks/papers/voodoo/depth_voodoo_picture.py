@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import ROOT
+from benchmarks.scenes.regions_scene import face_normals
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.rendering import render_body
 from kinefit.bodies.surfaces.places import body_mesh
@@ -38,10 +39,7 @@ def drawn(body: Body, state: BodyState, camera: Camera, back: NDArray) -> NDArra
     mesh = body_mesh(body)
     raster = render_body(body, state, camera, mesh=mesh)
     frames, _ = body.tree.forward(state.T_world_root, state.angles)
-    corners = mesh.posed(frames)[mesh.faces]
-    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
-    light = 0.45 + 0.55 * np.abs(n @ camera.T_camera_world[2, :3])
+    light = 0.45 + 0.55 * np.abs(face_normals(mesh.posed(frames), mesh.faces) @ camera.T_camera_world[2, :3])
     sides = {"r": _RIGHT, "l": _LEFT}
     colours = np.array([sides.get(name.rsplit("_", 1)[-1], _BODY) for name in body.tree.segments], float)
     painted = light[raster.face][..., None] * colours[raster.segment]

@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -18,8 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.commands import command, ended
 from benchmarks.figures import LEFT_OUT, NotMeasured, data, figure, quick
 from benchmarks.house.house_size import PACKAGE, code_lines
+from benchmarks.timing import took
 
 _GOALS = {
     "window_first_image": ("s", "<= 5"), "window_answer": ("ms, 95 of 100", "<= 200"), "window_cost": ("%", "<= 3"),
@@ -82,8 +83,8 @@ def chromium() -> Iterator[Any]:
 @contextmanager
 def running_app(folder: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """A running app, and its address."""
-    command = [sys.executable, "-m", "kinefit", "app", str(folder), "--port", "0", "--token", _TOKEN, "--no-browser"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    words = command("app", folder, "--port", 0, "--token", _TOKEN, "--no-browser")
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     assert process.stdout is not None
     try:
         found = re.search(r"http://\S+/", process.stdout.readline())
@@ -114,14 +115,14 @@ def _dropped(browser: Any, videos: list[Path], *, answers: int = 60) -> tuple[fl
         page.wait_for_function("[...document.images].some(image => image.complete && image.naturalWidth > 40)")
         first = time.perf_counter() - since
         page.get_by_role("button", name="Compute the motion").click()
-        since, took = time.perf_counter(), []
+        since, answered = time.perf_counter(), []
         other = browser.new_context(locale="en-GB").new_page() if answers else None
         if other is not None:
             other.goto(address)
             other.get_by_text("One folder up").wait_for()
         while not page.get_by_role("link", name="Report").count():
-            if other is not None and len(took) < answers:
-                took.append(_answer(other))
+            if other is not None and len(answered) < answers:
+                answered.append(_answer(other))
             page.wait_for_timeout(500)
         spent = time.perf_counter() - since
         typed = page.evaluate("window.typed")
@@ -131,7 +132,7 @@ def _dropped(browser: Any, videos: list[Path], *, answers: int = 60) -> tuple[fl
         page.context.close()
         if other is not None:
             other.context.close()
-        return first, took, typed, spent
+        return first, answered, typed, spent
 
 
 def _session(work: str) -> Path:
@@ -155,6 +156,4 @@ def _by_command(videos: list[Path]) -> float:
     with tempfile.TemporaryDirectory() as work:
         for video in videos:
             shutil.copyfile(video, Path(work) / video.name)
-        since = time.perf_counter()
-        subprocess.run([sys.executable, "-m", "kinefit", "track", work], check=True, capture_output=True)
-        return time.perf_counter() - since
+        return took(lambda: ended("track", work, check=True), clock=time.perf_counter)[1]

@@ -22,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import kinefit
+from benchmarks.commands import QUIET
+from benchmarks.commands import answer as command
 from benchmarks.figures import amount, data, figure
-from benchmarks.robustness.users.faults_users_pictures import QUIET, write_video
-from benchmarks.robustness.users.faults_users_pictures import run as command
+from benchmarks.robustness.users.faults_users_pictures import write_video
 from kinefit.errors import KinefitError
 from kinefit.readers.depth.recordings import read_clouds, read_depth
 from kinefit.readers.take.file import read_take
@@ -45,19 +46,22 @@ def run() -> None:
     for name, answers, least in (("cases", CASES, len(CASES)), ("siblings", SIBLINGS, WERE_RIGHT)):
         absent = name == "cases" and root is None
         chosen = {} if absent else dict(list(answers.items())[: amount(None, 6)])
-        counts, whole = Counter(_answers(chosen, root if name == "cases" else None)), chosen == answers
+        counts, whole = Counter(states(chosen, root if name == "cases" else None)), chosen == answers
         for state, goal in (("right", f">= {least}"), ("unsaid", "== 0")):
             value = None if absent else counts[state]
             told = f"of {len(answers)}"
             figure(f"faults_users_files_{name}_{state}", value, told, goal, "no recordings", whole=whole)
 
 
-def _answers(answers: Mapping[str, Answer], root: Path | None) -> list[str]:
-    """The state of each answer; one that ends in another exception than kinefit's is unsaid, and is shown."""
+def states(answers: Mapping[str, Answer], root: Path | None = None, place: str = "case") -> list[str]:
+    """The state of each answer to a copy of its folder in `root`, or to an empty folder of this name.
+
+    One that ends in another exception than kinefit's is unsaid, and is shown.
+    """
     out = []
     for name, answer in answers.items():
         with tempfile.TemporaryDirectory() as where:
-            folder = Path(where) / "case"  # calibrations beside it would be taken, too
+            folder = Path(where) / place  # calibrations beside it would be taken, too
             if root is None:
                 folder.mkdir()
             else:
@@ -182,11 +186,11 @@ def scene(frames: int = 12, *, radial: bool = False) -> NDArray:
     return np.array(out)
 
 
-def write_depth(folder: Path, counts: NDArray, name: str = "{:04d}.png") -> Path:
+def write_depth(folder: Path, counts: NDArray) -> Path:
     """Depth images as 16-bit files in folder/depth."""
     (folder / "depth").mkdir()
     for i, image in enumerate(np.rint(counts).astype(np.uint16)):
-        cv2.imwrite(str(folder / "depth" / name.format(i)), image)
+        cv2.imwrite(str(folder / "depth" / f"{i:04d}.png"), image)
     return folder / "depth"
 
 

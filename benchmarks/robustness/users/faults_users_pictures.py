@@ -13,13 +13,13 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
-from click.testing import CliRunner
 from numpy.typing import NDArray
 
 import kinefit
 from benchmarks.accuracy.people.people_real import take_of
+from benchmarks.commands import QUIET, answer
 from benchmarks.figures import data
-from kinefit.cli import main
+from benchmarks.scenes.simulated import rows_of
 from kinefit.errors import ObservationError
 from kinefit.observations import Keypoints
 from kinefit.readers.landmarks.detections import detections_file, read_detections
@@ -31,14 +31,7 @@ from kinefit.takes.missing import prepared
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 SIZE = (160, 96)
-QUIET = ("--no-overlays", "--no-report", "--formats", "motion", "--realtime", "--restart")
 BLAMES = ("has moved", "is late", "later than", "scale is wrong", "session")  # cameras, which are right
-
-
-def run(*args: object) -> tuple[int, str]:
-    """Exit status and output of a command."""
-    result = CliRunner().invoke(main, [str(arg) for arg in args])
-    return result.exit_code, " ".join(result.output.split())
 
 
 @contextmanager
@@ -69,7 +62,7 @@ def openpose() -> list[NDArray]:
     records = [read_openpose(folder / "openpose_json" / c, camera=c, rate=60.0) for c in CAMERAS]
     calibration = kinefit.read_calibration(folder / "Calib_refined_static.toml")
     man = kinefit.Recording.of_keypoints(calibration.select(CAMERAS), records).keypoints
-    return [np.nan_to_num(np.concatenate([k.points[:, 0], k.confidence[:, 0, :, None]], axis=-1)) for k in man]
+    return [rows_of(k) for k in man]
 
 
 def write_take(folder: Path, cameras: Sequence[Sequence[NDArray]], *, keys: str = "", array: bool = False) -> Path:
@@ -93,8 +86,8 @@ def write_take(folder: Path, cameras: Sequence[Sequence[NDArray]], *, keys: str 
 
 def stops(take: Path, *words: str) -> bool:
     """Whether `track` and `check` say these words, and blame no camera."""
-    status, told = run("track", take, *QUIET)
-    checked = run("check", take)[1]
+    status, told = answer("track", take, *QUIET)
+    checked = answer("check", take)[1]
     is_said = all(word in told and word in checked for word in words)
     return status != 0 and is_said and not any(blame in told + checked for blame in BLAMES)
 
@@ -142,13 +135,13 @@ def _shares(folder: Path) -> bool:
 
 def _flags(folder: Path) -> bool:
     cameras = _third(lambda v: np.where(v > 0.6, 2.0, np.where(v > 0, 1.0, 0.0)), array=False)
-    status, told = run("track", write_take(folder, cameras), *QUIET, "--out", folder / "out")
+    status, told = answer("track", write_take(folder, cameras), *QUIET, "--out", folder / "out")
     return status == 0 and "fault" not in told
 
 
 def _body_25(folder: Path) -> bool:
     with copied(folder) as case:
-        status, told = run("track", case / "take.toml", *QUIET, "--out", case / "out")
+        status, told = answer("track", case / "take.toml", *QUIET, "--out", case / "out")
         tall = kinefit.read_motion(case / "out" / "motion.npz").body.stature if status == 0 else 0.0
     return status == 0 and "fault" not in told and 1.6 < (tall or 0.0) < 1.9
 
@@ -161,7 +154,7 @@ def _stated_wrongly(folder: Path) -> bool:
 def _in_order(folder: Path, columns: Sequence[int], *words: str) -> bool:
     """Whether `track` says of points in another order what they are, and blames no camera."""
     take = write_take(folder, [[a[:, columns]] for a in openpose()])
-    told = run("track", take, *QUIET, "--out", folder / "out")[1]
+    told = answer("track", take, *QUIET, "--out", folder / "out")[1]
     return all(word in told for word in words) and not any(blame in told for blame in BLAMES)
 
 
@@ -179,31 +172,33 @@ def _human36m(folder: Path) -> bool:
 def _alphapose(folder: Path) -> bool:
     with copied(folder) as case:
         path = write_video(case / "cam1.mp4", range(20)).parent / "alphapose-results.json"
-        return _is_said(path, "AlphaPose")
+        return _is_read(path, "AlphaPose", 'format = "alphapose"')
 
 
-def _is_said(path: Path, program: str) -> bool:
-    """Whether the reader and `init` say what another program's file is, and how to split it."""
-    status, told = run("init", path.parent)
+def _is_read(path: Path, program: str, remedy: str) -> bool:
+    """Whether a file is read, told where it is taken for OpenPose's, and named by `init` without a calibration."""
+    status, told = answer("init", path.parent)
+    seen = read_keypoints(path, camera="c", rate=30.0)
     try:
         read_keypoints(path, format="openpose", camera="c", rate=30.0)
     except ObservationError as error:
-        said = program in error.problem and "pose_keypoints_2d" in (error.remedy or "")
-        return said and status == 0 and f"{path.name}: " in told and program in told and "not used" in told
+        said = program in error.problem and remedy in (error.remedy or "")
+        named = status == 0 and f"{path.name}: not used" in told
+        return said and named and seen.keypoint_set == "COCO_17" and bool(seen.confidence.any())
     return False
 
 
 def _coco(folder: Path) -> bool:
     path = write_video(folder / "cam1.mp4", range(20)).with_name("person_keypoints.json")
     path.write_text(json.dumps([{"image_id": i, "category_id": 1, "keypoints": [5.0, 6.0, 2] * 17} for i in range(9)]))
-    return _is_said(path, "COCO")
+    return _is_read(path, "COCO", 'format = "alphapose"')
 
 
 def _deeplabcut(folder: Path) -> bool:
     path = write_video(folder / "cam1.mp4", range(20)).with_name("cam1DLC_resnet50.csv")
     path.write_text("scorer,net,net,net\nbodyparts,nose,nose,nose\ncoords,x,y,likelihood\n0,1.0,2.0,0.9\n")
-    with_folder = run("init", folder)[1]
-    return "DeepLabCut" in with_folder and "not used" in with_folder
+    seen = read_keypoints(path, camera="c", rate=30.0)
+    return seen.points[0, 0, 0].tolist() == [1.0, 2.0] and f"{path.name}: not used" in answer("init", folder)[1]
 
 
 # ---- several people
@@ -241,7 +236,7 @@ def _never_seen_copy(folder: Path) -> bool:
 
 
 def _two_people(take: Path, folder: Path) -> bool:
-    status, told = run("track", take, *QUIET, "--out", folder / "out")
+    status, told = answer("track", take, *QUIET, "--out", folder / "out")
     motions = [folder / "out" / f"person-{k}" / "motion.npz" for k in (1, 2)]
     return status == 0 and "nan" not in told.lower() and all(path.is_file() for path in motions)
 
@@ -360,7 +355,7 @@ def _no_alarm(folder: Path) -> bool:
     told = []
     for array, of in ((False, openpose()), (True, arrays())):
         (folder / str(array)).mkdir()
-        told.append(run("track", write_take(folder / str(array), [[a] for a in of], array=array), *QUIET))
+        told.append(answer("track", write_take(folder / str(array), [[a] for a in of], array=array), *QUIET))
     return all(status == 0 and "no confidence" not in text for status, text in told)
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from benchmarks.commands import answer
 from benchmarks.figures import data
 from benchmarks.robustness.faults_sides import exchanged, mirrored
 from kinefit.exporters import write_markers
@@ -15,12 +14,6 @@ from kinefit.readers.markers import read_markers
 
 _WORLD, _LABELS = "mirrored (left-handed)", "labels are exchanged"
 _STANFORD = "data__grf__Subject4__MarkerData__%s1.trc"
-
-
-def _kinefit(*words: object) -> tuple[int, str]:
-    """Exit code and all that a command prints, on one line."""
-    done = subprocess.run([sys.executable, "-m", "kinefit", *map(str, words)], capture_output=True, text=True)
-    return done.returncode, " ".join((done.stdout + done.stderr).split())
 
 
 def _part(name: str, frames: int = 60, folder: str = "markers/nimblephysics") -> Markers:
@@ -41,35 +34,35 @@ def _take(folder: Path, markers: Markers, name: str, extra: str = "") -> Path:
 
 
 def _mirrored_world(folder: Path) -> bool:
-    code, text = _kinefit("markers", "fit", folder / "walk.trc", "--formats", "mot", "-o", folder.name + "-none")
+    code, text = answer("markers", "fit", folder / "walk.trc", "--formats", "mot", "-o", folder.name + "-none")
     return code == 2 and _WORLD in text
 
 
 def _sides_exchanged(folder: Path) -> bool:
-    code, text = _kinefit("markers", "fit", folder / "walk.trc", "--formats", "mot", "-o", folder.name + "-none")
+    code, text = answer("markers", "fit", folder / "walk.trc", "--formats", "mot", "-o", folder.name + "-none")
     return code == 2 and _LABELS in text
 
 
 def _track(folder: Path, markers: Markers, name: str, words: str) -> bool:
-    code, text = _kinefit("track", _take(folder, markers, name), "-o", folder / "out")
+    code, text = answer("track", _take(folder, markers, name), "-o", folder / "out")
     return code == 2 and words in text and name in text
 
 
 def _check(folder: Path, markers: Markers, name: str, words: str) -> bool:
-    code, text = _kinefit("check", _take(folder, markers, name), "--strict", "-o", folder / "check.html")
+    code, text = answer("check", _take(folder, markers, name), "--strict", "-o", folder / "check.html")
     return code == 2 and words in text
 
 
 def _audit(folder: Path, markers: Markers, words: str) -> bool:
     write_markers(markers, folder / "take.c3d")
-    code, text = _kinefit("markers", "audit", folder / "take.c3d", "--strict")
+    code, text = answer("markers", "audit", folder / "take.c3d", "--strict")
     return code == 2 and words in text
 
 
 def _mended(folder: Path) -> bool:
     """With `sides` the wrong take is tracked like the right one."""
     wrong = exchanged(_part(_STANFORD % "walking", 30))
-    code, _ = _kinefit("track", _take(folder, wrong, "walk.trc", 'sides = "exchanged"\n'), "-o", folder / "out")
+    code, _ = answer("track", _take(folder, wrong, "walk.trc", 'sides = "exchanged"\n'), "-o", folder / "out")
     return code == 0
 
 

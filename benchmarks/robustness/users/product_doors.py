@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import re
 import shutil
-import tempfile
 import tomllib
-import traceback
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,10 +18,11 @@ import cv2
 import numpy as np
 
 import kinefit
+from benchmarks.commands import QUIET
+from benchmarks.commands import answer as command
 from benchmarks.figures import amount, data, figure
-from benchmarks.robustness.users.faults_users_files import named_files, scene, videos, write_depth
-from benchmarks.robustness.users.faults_users_pictures import QUIET, write_video
-from benchmarks.robustness.users.faults_users_pictures import run as command
+from benchmarks.robustness.users.faults_users_files import named_files, scene, states, videos, write_depth
+from benchmarks.robustness.users.faults_users_pictures import write_video
 from kinefit.bodies.motion import Residuals
 from kinefit.exporters import write_markers
 from kinefit.exporters.report.report import write_report
@@ -41,26 +40,13 @@ def run() -> None:
     """Print how many inputs end right, said and unsaid, and each with its state."""
     absent = any(data(name) is None for name in (KINECT, WALK, "cases_of_users"))
     chosen = {} if absent else dict(list(DOORS.items())[: amount(None, 8)])
-    counts = Counter(_state(name, answer) for name, answer in chosen.items())
+    counts = Counter(states(chosen, place="session"))
     for state, goal in (("right", ">= 13"), ("said", ">= 17"), ("unsaid", "<= 0")):
         value = None if absent else counts[state]
         figure(f"product_doors_{state}", value, f"of {len(DOORS)}", goal, "no recordings", whole=chosen == DOORS)
     both = None if absent else counts["right"] + counts["said"]
     name = "product_doors_right_or_said"
     figure(name, both, f"of {len(DOORS)}", ">= 30", "no recordings", whole=chosen == DOORS)
-
-
-def _state(name: str, answer: Answer) -> str:
-    with tempfile.TemporaryDirectory() as where:
-        folder = Path(where) / "session"  # calibrations beside it would be taken, too
-        folder.mkdir()
-        try:
-            state = answer(folder)
-        except Exception:
-            traceback.print_exc(limit=3)
-            state = "unsaid"
-    print(f"# {state}: {name}", flush=True)
-    return state
 
 
 def verdict(*words: str, right: bool = False, status: int | None = None, printed: str = "") -> str:

@@ -219,7 +219,7 @@ class Motion:
             mine = isinstance(array, np.ndarray) and array.dtype == float and array.base is None
             if not mine or array.flags.writeable:
                 try:
-                    array = np.array(array, dtype=float)  # nobody else's
+                    array = np.array(array, dtype=float)  # no one else holds it
                 except (TypeError, ValueError) as error:
                     problem = f"{name} of a motion is a {type(array).__name__} that is not an array of numbers"
                     remedy = "Give arrays of as many frames as there are times."

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from kinefit._files import repeated
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.morphs.operators import Operator
 from kinefit.bodies.surfaces import MeshSurface, Surface
 from kinefit.bodies.tree import COLUMNS, BodyState, Closure, KinematicTree, without_landmarks
 from kinefit.errors import BodyError, check_choice
@@ -132,7 +131,11 @@ def without_part(body: Body, name: str) -> Body:
             replace(s, segment=s.segment - (s.segment > removed)) for s in body.surfaces if s.segment != removed
         ),
         aliases={c: {s: n for s, n in names.items() if s != name} for c, names in body.aliases.items()},
-        morphs=tuple(m for m in body.morphs if not _is_about(m, name, tree.coordinates, tree.owners == removed)),
+        morphs=tuple(
+            m for m in body.morphs  # neither on this segment, nor steered by one of its coordinates
+            if getattr(m, "segment", None) != name
+            and tree.owners[tree.coordinates.index(m.steering.coordinate)] != removed
+        ),
         closures=without_landmarks(body.closures, left.landmarks.names),
         dimensions=tuple(d for d in body.dimensions if name not in d.moves),
     )
@@ -204,11 +207,6 @@ def carry_dofs(values: NDArray, old: Body, new: Body, *, missing: float = 0.0) -
         raise BodyError(problem, remedy="Give one for each of the old body's.")
     known = dict(zip(old.dof_names, values))
     return np.array([known.get(name, missing) for name in new.dof_names], float)
-
-
-def _is_about(morph: Operator, segment: str, coordinates: tuple[str, ...], own: NDArray) -> bool:
-    """Whether a morph acts on a segment, or depends on one of its coordinates."""
-    return getattr(morph, "segment", None) == segment or own[coordinates.index(morph.steering.coordinate)]
 
 
 def _with_segment(tree: KinematicTree, name: str, parent: int, joint: PartJoint) -> KinematicTree:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import _kernels
 from kinefit.errors import BodyError, check_choice
+from kinefit.geometry.lines import perpendiculars
 
 COLUMNS = ("axes", "prismatic", "lower", "upper", "usual", "spread")
 """Arrays of a tree with an entry for each coordinate, but for the owners."""
@@ -443,9 +444,7 @@ class Closure:
         if self.kind == "plane":
             return axis[None]
         if self.kind == "line":
-            first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-            first /= np.linalg.norm(first)
-            return np.stack([first, np.cross(axis, first)])
+            return np.stack(perpendiculars(axis))
         return np.eye(3)
 
     @property

@@ -13,7 +13,9 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
+from functools import wraps
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -61,7 +63,7 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 
 REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
-"""Errors of the system for which nobody is to blame but the disk."""
+"""Errors of the disk, not of kinefit or its user."""
 
 _VERBOSE, _QUIET, _EVENTS = "kinefit.verbose", "kinefit.quiet", "kinefit.events"
 _EVENTS_NICE = 10  # lower priority than the program that waits, whose page must answer
@@ -77,6 +79,27 @@ def _remember(key: str) -> Callable[[click.Context, click.Parameter, bool], bool
         return value
 
     return remember
+
+
+def gathered(name: str, build: Callable[..., Any] | str, *options: str) -> Callable[[Callable], Callable]:
+    """Give a command the values of some options as one argument: what `build` ("module:class", or a function) makes."""
+
+    def decorate(command: Callable) -> Callable:
+        @wraps(command)
+        def called(*args: Any, **given: Any) -> Any:
+            values = {option: given.pop(option) for option in options}
+            make = resolve_name(build) if isinstance(build, str) else build
+            return command(*args, **given, **{name: make(**values)})
+
+        return called
+
+    return decorate
+
+
+def is_stated(name: str) -> bool:
+    """Whether the command that runs was given this option in so many words."""
+    source = click.get_current_context().get_parameter_source(name)
+    return source is click.core.ParameterSource.COMMANDLINE
 
 
 def verbose_option(command: Callable) -> Callable:
@@ -123,12 +146,6 @@ def _emit(event: str, **content: Any) -> None:
     import json
 
     print(json.dumps({"event": event, **content}, ensure_ascii=False), file=sys.stderr, flush=True)
-
-
-def token_option(command: Callable) -> Callable:
-    """Add `--token` to a command that opens a server."""
-    text = "Secret part of the page's address, 16 to 128 characters.  [default: a new random one each time]"
-    return click.option("--token", envvar=TOKEN_VARIABLE, show_envvar=True, metavar="TEXT", help=text)(command)
 
 
 def is_verbose() -> bool:
@@ -251,6 +268,13 @@ def tell_bug(error: Exception) -> None:
         remedy = "Send this traceback with the take file to the developers of kinefit"
     _complain(f"an error in kinefit itself: {type(error).__name__}: {error}", **{"at": versions, "try": remedy + "."})
 
+
+token_option = click.option(
+    "--token", envvar=TOKEN_VARIABLE, show_envvar=True, metavar="TEXT",
+    help="Secret part of the page's address, 16 to 128 characters.  [default: a new random one each time]",
+)
+host_option = click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 admits other computers.")
+"""For commands that open a server."""
 
 hide_faces_option = click.option(
     "--hide-faces", is_flag=True,

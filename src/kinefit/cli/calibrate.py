@@ -166,8 +166,8 @@ def bar(
     sigma = LENGTH_SIGMA if length_sigma is None else length_sigma
     check_bar(length, sigma)
     on_floor, known = _frames(floor), _distance(distance)
-    beside = [out, out.with_suffix(".csv"), out.with_suffix(".png")]
-    for file in beside:
+    written = [out, out.with_suffix(".csv"), out.with_suffix(".png")]
+    for file in written:
         _screen.check_new(file, overwrite)
     kept = read_calibration(interiors, exteriors=False) if interiors else None
     with _screen.bars() as step:
@@ -179,10 +179,10 @@ def bar(
         )  # fmt: skip
         step("calibrating", 1, 1)
     write_calibration(result.rig, out)
-    _write_table(result, beside[1])
-    _write_picture(result, beside[2])
+    _write_table(result, written[1])
+    _write_picture(result, written[2])
     _tell_bar(result, known is not None)
-    _screen.say(f"Written: {out}, {beside[1].name} (all parameters), {beside[2].name} (coverage)")
+    _screen.say(f"Written: {out}, {written[1].name} (all parameters), {written[2].name} (coverage)")
 
 
 def _seen(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -35,21 +36,29 @@ Examples:
 )
 @click.option(
     "--quality", type=click.Choice(list(detecting.QUALITIES)),
-    help="Landmark network; best takes 3 times as long as balanced, 6 times for one video.  "
+    help="Landmark network; best takes 3 times as long as balanced, 6 times for one video. auto is best that skips "
+    "images above 22 Hz where the motion is smooth.  "
     "[default: as in existing results, or best]",
 )
 @click.option(
     "--network", type=_screen.PATH, metavar="FILE",
-    help="Your own landmark network (TensorFlow Lite) with the inputs and outputs of BlazePose.",
+    help="Your own landmark network: ONNX (SimCC or heatmaps, such as RTMPose, HRNet, ViTPose), or BlazePose's tflite.",
+)
+@click.option(
+    "--detector", type=_screen.PATH, metavar="FILE", help="Your own detector of people: ONNX of YOLOX or RTMDet.",
+)
+@click.option(
+    "--calibrate", is_flag=True,
+    help="With --network and a take of 3 cameras or more: estimate its errors by confidence, for later fits.",
 )
 @click.option("--force", is_flag=True, help="Detect again, even if results exist.")
 @click.option("-o", "--out", type=_screen.PATH, help="Folder of results for videos without a take.")
 @_screen.verbose_option
 def detect(
     inputs: tuple[Path, ...], people: int, masks: bool, hands: bool | None, face: bool | None, quality: str | None,
-    network: Path | None, force: bool, out: Path | None,
+    network: Path | None, detector: Path | None, calibrate: bool, force: bool, out: Path | None,
 ) -> None:
-    """Detect people, their 33 keypoints and their masks in every image of the videos.
+    """Detect people, their keypoints and their masks in the images of the videos.
 
     Give one TAKE (.toml), or VIDEO files. `kinefit track` uses the detections for a take without [[keypoints]]. Videos
     with results are skipped; Ctrl-C keeps the finished videos. The command needs the extra `detect`:
@@ -59,20 +68,42 @@ def detect(
         raise click.UsageError("give --quality or --network, not both")
     if not people and not hands:
         raise click.UsageError("--people 0 detects only hands: give --hands too")
+    if calibrate and network is None:
+        raise click.UsageError("--calibrate states how exact a network of your own is: give --network too")
+    if calibrate and not _is_take(inputs[0]):
+        raise click.UsageError("--calibrate needs a take of calibrated cameras, not videos alone")
     jobs = _jobs(inputs, out)
     if out is not None:
         _screen.check_folder(out)
     with _screen.bars() as step:
-        settings = detecting.DetectionSettings(people, masks, hands, face, network or quality)
+        settings = detecting.DetectionSettings(people, masks, hands, face, network or quality, detector)
         done = detecting.detect(jobs, settings, force=force, progress=step, tell=_screen.note)
     _show(jobs, done)
-    somebody(jobs, _screen.note)
+    files = somebody(jobs, _screen.note)
+    if calibrate and network is not None:
+        _calibrate(inputs[0], files, network)
+
+
+def _calibrate(take: Path, files: dict[str, Path], network: Path) -> None:
+    from kinefit.readers.take.entries import KeypointsEntry
+    from kinefit.readers.take.file import read_take
+    from kinefit.takes.preparing.network_errors import calibrate_network
+
+    entries = tuple(KeypointsEntry(camera=camera, file=file, format="detect") for camera, file in files.items())
+    file, found, count = calibrate_network(replace(read_take(take), keypoints=entries), network)
+    for confidence, sigma in zip(found.confidence, found.sigma):
+        _screen.say(f"confidence {confidence:.2f}: {100 * sigma:.2f} % of a person's extent")
+    _screen.say(f"Written, from {count} points that the other cameras place: {file}")
+
+
+def _is_take(path: Path) -> bool:
+    return path.suffix.lower() == ".toml" or path.is_dir()
 
 
 def _jobs(inputs: tuple[Path, ...], out: Path | None) -> list[detecting.DetectionJob]:
     from kinefit.readers.take.file import read_take
 
-    takes = [path for path in inputs if path.suffix.lower() == ".toml" or path.is_dir()]
+    takes = [path for path in inputs if _is_take(path)]
     if takes:
         if len(inputs) > 1 or out is not None:
             raise click.UsageError("give one take without --out, or video files")

@@ -207,7 +207,7 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, steps: Seque
 
     from kinefit._files import regular, write_text
     from kinefit.bodies.serial import save_body
-    from kinefit.fitting.initialization.from_points import clickable, clicked_points, clicked_start
+    from kinefit.fitting.initialization.from_points import check_landmarks, clicked_points, clicked_start
     from kinefit.readers.landmarks.annotations import clicks_text
 
     assert seen.rig is not None
@@ -216,10 +216,7 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, steps: Seque
     if unknown:
         raise TrackingError(choices("camera of the take", unknown[0], seen.rig.names))
     every = [name for of in clicks.points.values() for name in of]
-    named = [name for step in steps for of in step.points.values() for name in of]
-    strange = [name for name in named if name not in body.landmarks.names]
-    if strange:
-        raise TrackingError(choices(f"landmark of body '{body.name}'", strange[0], clickable(body)))
+    check_landmarks(body, (name for step in steps for of in step.points.values() for name in of))
     once = [name for name in dict.fromkeys(every) if every.count(name) == 1]
     names = clicks.names
     uv = np.full((len(names), len(seen.rig), 2), np.nan)

@@ -26,23 +26,23 @@ Examples:
 @click.argument("sources", metavar="SOURCE [OTHER]...", nargs=-1, required=True, type=_screen.PATH)
 @click.option("--take", type=_screen.PATH, help="Take file that gives cameras and markers.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="0: any free port.")
-@click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 admits other computers.")
+@_screen.host_option
 @_screen.token_option
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page in the browser.")
 @_screen.hide_faces_option
 @click.option("--cylinders", is_flag=True, help="Show the body's cylinders and bones instead of a skin.")
 @click.option("--html", type=_screen.PATH, help="Write one self-contained page instead of serving it.")
 @_screen.verbose_option
+@_screen.gathered("access", "kinefit.studio.serving.access:Access", "host", "token")
 def view(
-    sources: tuple[Path, ...], take: Path | None, port: int, host: str, token: str | None, browser: bool,
-    cylinders: bool, html: Path | None, hide_faces: bool,
+    sources: tuple[Path, ...], take: Path | None, port: int, access: Access, browser: bool, cylinders: bool,
+    html: Path | None, hide_faces: bool,
 ) -> None:
     """Show a motion, a take or a folder of results as a 3D scene in the browser.
 
     SOURCE is a motion file (.npz), a take file (.toml) or a folder that `kinefit track` wrote. Further motions are
     shown in the same scene. Ctrl-C ends the command.
     """
-    from kinefit.studio.serving.access import Access
     from kinefit.studio.viewers.viewed import gather
 
     if html is not None:
@@ -52,7 +52,7 @@ def view(
     if html is not None:
         _write(recording, html, cylinders)
     else:
-        _serve(recording, port, Access(host, token), browser, cylinders)
+        _serve(recording, port, access, browser, cylinders)
 
 
 def _serve(recording: ViewerContent, port: int, access: Access, browser: bool, cylinders: bool) -> None:
@@ -101,7 +101,8 @@ Examples:
 @_screen.token_option
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page.")
 @_screen.verbose_option
-def app(folder: Path, port: int, token: str | None, browser: bool) -> None:
+@_screen.gathered("access", "kinefit.studio.serving.access:Access", "token")
+def app(folder: Path, port: int, access: Access, browser: bool) -> None:
     """Do all of it in a page of the browser: from a folder of videos to a report, corrections and exports.
 
     FOLDER is where your recordings are, and where dropped videos are put. Only this computer can open the page; nothing
@@ -110,7 +111,6 @@ def app(folder: Path, port: int, token: str | None, browser: bool) -> None:
     pip install 'kinefit[app]'.
     """
     from kinefit.studio.app.server import serve
-    from kinefit.studio.serving.access import Access
 
     root = folder.absolute()
     if not root.is_dir():
@@ -119,7 +119,6 @@ def app(folder: Path, port: int, token: str | None, browser: bool) -> None:
     if printable(root) != str(root):
         problem = "the name of this folder is not UTF-8, as the addresses of pages are"
         raise FileError(problem, file=folder, remedy="Rename it.")
-    access = Access(token=token)
 
     def opened(port: int) -> None:
         _screen.say(f"kinefit app at {access.url(port)}  (Ctrl-C ends)")

@@ -99,7 +99,7 @@ def _file(pynwb: Any, motion: Motion) -> Any:
 
 
 def _pose(ndx_pose: Any, pynwb: Any, motion: Motion, bones: list[str]) -> list[Any]:
-    """Skeleton and pose estimation, and time series beside them."""
+    """Skeleton and pose estimation, and further time series."""
     tree, sure = motion.body.tree, confidence(motion.joint_std)
     centres = motion.joint_centres
     skeleton = ndx_pose.Skeleton(

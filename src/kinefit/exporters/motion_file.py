@@ -23,7 +23,7 @@ from kinefit.bodies.serial import arrays_of, body_to_arrays
 from kinefit.errors import ExportError
 from kinefit.exporters.skeletons.common import turned
 from kinefit.geometry import se3
-from kinefit.observations import Detections
+from kinefit.observations import MEDIAPIPE_33, Detections
 from kinefit.readers import motion as motion_format
 from kinefit.readers.landmarks import detections as detections_format
 
@@ -76,7 +76,10 @@ def write_detections(detections: Detections, path: str | PathLike[str], *, key: 
         for name in ("points", "confidence", "lifted", "hands", "hand_confidence", "face", "face_confidence")
         if (array := getattr(detections, name)) is not None
     }  # fmt: skip
-    keys = ("camera", "rate", "size", "mask_runs", "mask_starts", *(() if detections.times is None else ("times",)))
+    keys = ["camera", "rate", "size", "mask_runs", "mask_starts"]
+    keys += [name for name in ("times", "looked") if getattr(detections, name) is not None]
+    if detections.network or detections.names != MEDIAPIPE_33:
+        keys += ["names", "keypoint_set", "network"]
     arrays |= {"key": key, **{name: getattr(detections, name) for name in keys}}
     _write(path, "a file of detections", detections_format, arrays)
 

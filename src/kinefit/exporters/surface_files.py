@@ -93,7 +93,7 @@ def write_field_picture(
     ----------
     image : (H, W) grey values of the first camera
     values : (N,), one for each point; the scale runs from their 1st to their 99th percentile
-    title, unit : written beside the scale
+    title, unit : written next to the scale
     """
     shown = surface.measured & np.isfinite(values)
     if not shown.any():

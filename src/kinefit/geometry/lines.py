@@ -1,7 +1,7 @@
 """Plücker lines and planes: distances of points and lines to them, and their derivatives (P1 2.3, P3 eqs. 4-5).
 
 A line is (n, m): unit direction n and moment m = x × n of any of its points x [m]. A plane is (n, d): unit normal and
-n·x = d [m]. Shapes are given for one leading axis (N,); all functions but `perpendiculars` take any leading axes.
+n·x = d [m]. Shapes are given for one leading axis (N,); all functions take any leading axes.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ def _unit(v: NDArray, what: str) -> NDArray:
 
 def perpendiculars(directions: NDArray) -> tuple[NDArray, NDArray]:
     """Two unit directions (N, 3) each, orthogonal to unit directions (N, 3) and to each other."""
-    first = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    first = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=-1)])
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
     return first, np.cross(directions, first)
 
 

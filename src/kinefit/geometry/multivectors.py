@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -68,12 +68,7 @@ def _half_sum(a: int, b: int, sign: int) -> dict[int, float]:
     return {k: s for k, s in total.items() if s}
 
 
-def _commutator(a: int, b: int) -> dict[int, float]:
-    return _half_sum(a, b, -1)
-
-
-def _anticommutator(a: int, b: int) -> dict[int, float]:
-    return _half_sum(a, b, 1)
+_commutator, _anticommutator = (partial(_half_sum, sign=sign) for sign in (-1, 1))
 
 
 Rule = Callable[[int, int], dict[int, float]]

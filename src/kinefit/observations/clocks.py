@@ -231,6 +231,8 @@ def on_steps(keypoints: Keypoints, times: NDArray, rate: float, frames: tuple[in
             array[step] = (1.0 - s) * source[a] + s * source[b][next_person]
             array[step, unknown] = np.nan
     arrays["confidence"][~np.isfinite(arrays["points"]).all(axis=-1)] = 0.0
+    if keypoints.looked is not None:
+        arrays["looked"] = keypoints.looked[nearest]
     return replace(keypoints, rate=rate, time_offset=frames[0] / rate, **arrays)
 
 

@@ -1,4 +1,4 @@
-"""Detections of kinefit's own detector in one video: landmarks, masks and hands of people."""
+"""Detections of `kinefit detect` in one video: landmarks, masks and hands of people."""
 
 from __future__ import annotations
 
@@ -50,19 +50,32 @@ _MESH_NAMES = {k: f"face_{name}" for k, name in _MESH.items()} | {
 MEDIAPIPE_478 = tuple(_MESH_NAMES.get(k, f"face_{k}") for k in range(478))
 """Names of the points of MediaPipe's face mesh, in its order; the last ten are the irises'."""
 
+_OPENPOSE_FINGERS = "Thumb Index Middle Ring Little"
+OPENPOSE_HAND_42 = tuple(
+    f"{side}Hand{point}" for side in "LR"
+    for point in ("Wrist", *(f"{finger}{k}" for finger in _OPENPOSE_FINGERS.split() for k in range(1, 5)))
+)  # fmt: skip
+"""Names of the points of both hands of OpenPose and COCO-WholeBody, which are in MediaPipe's order."""
+
+WITH_HANDS = {
+    "MEDIAPIPE_33": ("MEDIAPIPE_75", MEDIAPIPE_75[33:]), "COCO_17": ("COCO_WHOLEBODY_133", OPENPOSE_HAND_42),
+    "HALPE_26": ("COCO_WHOLEBODY_133", OPENPOSE_HAND_42), "BODY_25": ("BODY_25_HANDS", OPENPOSE_HAND_42),
+}  # fmt: skip
+"""{keypoint set: set that has hands, too, and the names of both hands in it}"""
+
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Detections of kinefit's own detector in one video: people, each in one column, with their masks.
+    """Detections of `kinefit detect` in one video: people, each in one column, with their masks.
 
     Parameters
     ----------
     camera : str
     rate : float [Hz]
     size : (width, height) [px] of the video's image
-    points : (F, P, 33, 2) [px]
-        Landmarks of MEDIAPIPE_33 in the video's image; NaN in frames without the person. P may be 0.
-    confidence : (F, P, 33)
+    points : (F, P, K, 2) [px]
+        Landmarks in the video's image, of MEDIAPIPE_33 or of `names`; NaN in frames without the person. P may be 0.
+    confidence : (F, P, K)
         Probability that a landmark is in the image and not occluded; 0 in frames without the person.
     mask_runs : (N,)
         Run lengths of all masks, ordered by frame, then person: down the columns of the image, starting with pixels
@@ -70,9 +83,9 @@ class Detections:
     mask_starts : (F * P + 1,)
         Start of each mask in `mask_runs`; a cell without runs has no mask.
     source : str
-    lifted : (F, P, 33, 3) [m], optional
+    lifted : (F, P, K, 3) [m], optional
         3D landmarks relative to the middle of the hips, along the image's u and v and away from the camera, at the
-        network's own scale; NaN in frames without the person.
+        network's own scale; NaN in frames without the person. None from networks that give none.
     hands : (F, P, 2, 21, 2) [px], optional
         Landmarks of MEDIAPIPE_HAND_21 of the left and the right hand; NaN for undetected hands. Hands may be detected
         without the person's body.
@@ -84,6 +97,14 @@ class Detections:
         Probability that there is a face, 0 for points outside of the image and where no face is seen.
     times : (F,) [s], optional
         Time of each frame from the first, increasing; None: at the rate.
+    keypoint_set : str
+        Set that the names are of; "" for landmarks of the body.
+    names : (K,) str
+        Of the points.
+    network : str
+        File of a network of one's own; "" for the built-in one.
+    looked : (F,) bool, optional
+        Frames whose image was looked at; None: all.
 
     Raises
     ------
@@ -105,27 +126,35 @@ class Detections:
     times: NDArray | None = None
     face: NDArray | None = None
     face_confidence: NDArray | None = None
+    keypoint_set: str = "MEDIAPIPE_33"
+    names: tuple[str, ...] = MEDIAPIPE_33
+    network: str = ""
+    looked: NDArray | None = None
 
     def __post_init__(self) -> None:
         points, confidence = frozen(self.points), frozen(self.confidence)
         starts, runs = frozen(self.mask_starts, int), frozen(self.mask_runs, np.uint32)
         cells = points.shape[0] * points.shape[1] if points.ndim == 4 else -1
-        fits = points.shape[2:] == (33, 2) and confidence.shape == points.shape[:3]
+        count = len(self.names)
+        fits = points.shape[2:] == (count, 2) and confidence.shape == points.shape[:3]
         fits = fits and starts.shape == (cells + 1,) and runs.ndim == 1
         if not fits or starts[0] != 0 or starts[-1] != len(runs) or np.any(np.diff(starts) < 0):
             raise ObservationError(
                 f"detections of camera {self.camera} have shape {points.shape} with confidence {confidence.shape}, "
                 f"starts of masks {starts.shape} and runs {runs.shape}", file=self.source or None,
-                remedy="Give (frames, people, 33, 2), (frames, people, 33), (frames * people + 1,) starts, (N,) runs.",
+                remedy=f"Give (frames, people, {count}, 2), (frames, people, {count}), (frames * people + 1,) starts, "
+                "(N,) runs.",
             )
         lifted = self.lifted
         if lifted is not None:
             what = f"lifted landmarks of camera {self.camera}"
             lifted = frozen(lifted, float, what, (*points.shape[:3], 3), self.source)
-        for part, confidence_of, count in (("hands", "hand_confidence", (2, 21)), ("face", "face_confidence", (478,))):
+        shapes: dict[str, tuple[int, ...]] = {"hand": (2, 21), "face": (478,)}
+        for part, confidence_of in (("hands", "hand_confidence"), ("face", "face_confidence")):
+            shape_of = shapes[part[:4]]
             values, confidences = getattr(self, part), getattr(self, confidence_of)
             if values is not None or confidences is not None:
-                what, shape = f"{part} of camera {self.camera}", (*points.shape[:2], *count)
+                what, shape = f"{part} of camera {self.camera}", (*points.shape[:2], *shape_of)
                 values = frozen(values, float, what, (*shape, 2), self.source)
                 confidences = frozen(confidences, float, f"the confidence of {what}", shape, self.source)
             freeze(self, **{part: values, confidence_of: confidences})
@@ -141,7 +170,10 @@ class Detections:
         if times is not None:
             times = checked_times(times, f"camera {self.camera}", self.source)
             times = frozen(times, float, f"times of camera {self.camera}", points.shape[:1], self.source)
-        freeze(self, times=times)
+        looked = self.looked
+        if looked is not None:
+            looked = frozen(looked, bool, f"looks of camera {self.camera}", points.shape[:1], self.source)
+        freeze(self, times=times, looked=looked)
 
     def within(self, first: int, frames: int) -> Detections:
         """The detections padded to a longer video, as its frames from `first` on, without times; no one in the others.
@@ -156,7 +188,7 @@ class Detections:
             return np.pad(array, ((first, after), *[(0, 0)] * (array.ndim - 1)), constant_values=value)
 
         values: dict[str, float] = dict.fromkeys(("points", "lifted", "hands", "face"), np.nan)
-        values |= dict.fromkeys(("confidence", "hand_confidence", "face_confidence"), 0.0)
+        values |= dict.fromkeys(("confidence", "hand_confidence", "face_confidence"), 0.0) | {"looked": True}
         arrays = {name: getattr(self, name) for name in values}
         given: dict[str, Any] = {n: padded(array, values[n]) for n, array in arrays.items() if array is not None}
         starts = np.pad(self.mask_starts, (first * people, after * people), mode="edge")
@@ -189,7 +221,7 @@ class Detections:
         self, camera: str | None = None, *, image_frame: ImageFrame | None = None, time_offset: float = 0.0,
         face: bool = False,
     ) -> Keypoints:  # fmt: skip
-        """The landmarks of all people as a detector's keypoints: MEDIAPIPE_33, with hands MEDIAPIPE_75.
+        """The landmarks of all people as a detector's keypoints: of their own set, with hands of the set that has them.
 
         Parameters
         ----------
@@ -204,7 +236,7 @@ class Detections:
         Raises
         ------
         ObservationError
-            Nobody, or no face, is seen in any frame; faces were not looked for.
+            No person, or no face, is detected in any frame; faces were not looked for.
         """
         if not self.seen.any():
             raise ObservationError(
@@ -212,11 +244,14 @@ class Detections:
                 file=self.source or None,
                 remedy="The detector needs a person of a tenth of the image's height or more; or remove this camera.",
             )
-        points, confidence, lifted, names = self.points, self.confidence, self.lifted, MEDIAPIPE_33
+        points, confidence, lifted, names = self.points, self.confidence, self.lifted, self.names
+        keypoint_set = self.keypoint_set
         if face:
             points, confidence, lifted, names = *self._faces(camera), None, MEDIAPIPE_478
-        elif self.hands is not None and self.hand_confidence is not None:
-            people, names = self.seen.shape, MEDIAPIPE_75
+            keypoint_set = "MEDIAPIPE_478"
+        elif self.hands is not None and self.hand_confidence is not None and keypoint_set in WITH_HANDS:
+            people, (keypoint_set, hands) = self.seen.shape, WITH_HANDS[keypoint_set]
+            names = (*names, *hands)
             points = np.concatenate([points, self.hands.reshape(*people, 42, 2)], axis=2)
             confidence = np.concatenate([confidence, self.hand_confidence.reshape(*people, 42)], axis=2)
             if lifted is not None:  # hands are not lifted
@@ -224,8 +259,8 @@ class Detections:
         if image_frame is not None:
             points, lifted = in_calibration(points, lifted, image_frame)
         return Keypoints(
-            camera or self.camera, f"MEDIAPIPE_{len(names)}", names, self.rate, points, confidence,
-            time_offset=time_offset, source=self.source, lifted=lifted,
+            camera or self.camera, keypoint_set, names, self.rate, points, confidence,
+            time_offset=time_offset, source=self.source, lifted=lifted, looked=self.looked,
         )
 
     def _faces(self, camera: str | None) -> tuple[NDArray, NDArray]:

@@ -124,6 +124,10 @@ class Keypoints:
         3D landmarks of a network, see `LiftedFrame`; NaN for undetected ones.
     sides_known : (F,) bool, optional
         Frames whose left and right are stated: no correction of swapped sides exchanges them.
+    sigma : float [px], optional
+        Standard deviation of a keypoint of confidence 1, where the detector was calibrated.
+    looked : (F,) bool, optional
+        Frames whose image the detector looked at; default: all. Between two looks the motion goes on.
 
     Raises
     ------
@@ -142,6 +146,8 @@ class Keypoints:
     source: str = ""
     lifted: NDArray | None = None
     sides_known: NDArray | None = None
+    sigma: float | None = None
+    looked: NDArray | None = None
 
     def __post_init__(self) -> None:
         check_seen(self.camera, self.rate, self.names)
@@ -154,18 +160,22 @@ class Keypoints:
             check_pixels(points, confidence, what, self.source or None)
         if lifted is not None:
             lifted = frozen(lifted, float, f"lifted {what}", (*shape, 3), self.source)
-        sides_known = self.sides_known
+        sides_known, looked = self.sides_known, self.looked
         if sides_known is not None:
             sides_known = frozen(sides_known, bool, f"the known sides of {what}", shape[:1], self.source)
-        freeze(self, points=points, confidence=confidence, lifted=lifted, sides_known=sides_known)
+        if looked is not None:
+            looked = frozen(looked, bool, f"the looks of {what}", shape[:1], self.source)
+        freeze(self, points=points, confidence=confidence, lifted=lifted, sides_known=sides_known, looked=looked)
 
     def __len__(self) -> int:
         return len(self.points)
 
     def rows(self, frames: slice, time_offset: float) -> Keypoints:
         """The keypoints of some frames; `time_offset` [s] is the time of the first."""
-        sides_known = None if self.sides_known is None else self.sides_known[frames]
-        return self._changed(lambda values: values[frames], time_offset=time_offset, sides_known=sides_known)
+        sides_known, looked = (None if v is None else v[frames] for v in (self.sides_known, self.looked))
+        return self._changed(
+            lambda values: values[frames], time_offset=time_offset, sides_known=sides_known, looked=looked
+        )
 
     def without(self, frames: NDArray) -> Keypoints:
         """The keypoints without the detections of some frames; `frames` (F,) bool."""

@@ -15,6 +15,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.depth import to_points
 from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud, by_record
 from kinefit.papers._voodoo_boxes import Boxes, in_body_box
+from kinefit.sensors.channels import joined
 
 _MAX_COLUMNS = 160  # of a depth image, approximately: those of P2's time-of-flight camera
 
@@ -113,8 +114,4 @@ def _all(parts: list, columns: int) -> tuple[PointSet, NDArray, NDArray]:
     if not parts:
         return PointSet((), np.zeros(0, np.int64), np.zeros((0, 3))), np.zeros((0, columns)), np.zeros(0)
     sets, values, weights = zip(*parts)
-    points = PointSet(
-        tuple(n for s in sets for n in s.names), np.concatenate([s.segments for s in sets]),
-        np.concatenate([s.points for s in sets]),
-    )  # fmt: skip
-    return points, np.concatenate(values), np.concatenate(weights)
+    return joined(sets), np.concatenate(values), np.concatenate(weights)

@@ -8,6 +8,8 @@ from kinefit.readers.depth.recordings import read_depth as read_depth
 from kinefit.readers.landmarks.detections import read_detections as read_detections
 from kinefit.readers.landmarks.keypoints import read_caliscope_csv as read_caliscope_csv
 from kinefit.readers.landmarks.keypoints import read_keypoints as read_keypoints
+from kinefit.readers.landmarks.networks import NetworkFormat as NetworkFormat
+from kinefit.readers.landmarks.networks import PointLayout as PointLayout
 from kinefit.readers.markers import read_markers as read_markers
 from kinefit.readers.motion import read_motion as read_motion
 from kinefit.readers.plugins import FileFormat as FileFormat

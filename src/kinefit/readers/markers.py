@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import metres_of, read_bytes
-from kinefit.errors import FileError, ObservationError, names_file, shortened
+from kinefit.errors import FileError, KinefitError, ObservationError, names_file, shortened
 from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
 from kinefit.readers.plates import PlatesRead, read_plates
 from kinefit.readers.plugins import MARKERS, FileFormat
 
+_MIN_PIXELS = 200.0  # "metres" that no marker in one plane is away from the origin, and points in images are
 _MAX_NEAR_ORIGIN = 0.01  # [m] from the origin, of a person in metres that are read as millimetres
 _OF_EVENT: dict[str, tuple[str, type]] = {
     "label": ("LABELS", str), "context": ("CONTEXTS", str), "subject": ("SUBJECTS", str),
@@ -58,8 +59,8 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
     FileError
         Missing, damaged or truncated (the message has the number of readable frames), or neither C3D nor TRC.
     ObservationError
-        No or unknown unit, or two in one file; no marker, or none visible in any frame; a rate that contradicts the
-        times.
+        No or unknown unit, two in one file, or pixels; no marker, or none visible in any frame; a rate that
+        contradicts the times.
     PluginError
         A plug-in fails.
     """
@@ -67,6 +68,9 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
     if name is None:
         raise FileError("neither C3D nor TRC", remedy="Markers are read from .c3d and .trc files, or by a plug-in.")
     read = MARKERS.get(name).call("read", path, unit=unit, valid=lambda m: isinstance(m, Markers), what="Markers")
+    if unit is None and _is_of_image(read):
+        problem, remedy = "its points are pixels of an image", 'Name it in [[keypoints]] with format = "sports2d".'
+        raise ObservationError(problem, remedy=f"{remedy} Or state the unit of its markers.")
     return _of_one_unit(read)
 
 
@@ -103,6 +107,20 @@ def _unseen(markers: int, frames: int) -> ObservationError:
     problem = f"none of the {markers} markers is visible in any of the {frames} frames"
     remedy = "Export it again with its trajectories, or choose another trial."
     return ObservationError(problem, remedy=remedy)
+
+
+def _is_of_image(markers: Markers) -> bool:
+    """Whether positions in "metres" are pixels, as Sports2D writes them: all in the plane z = 0, and far from 0."""
+    x = np.nan_to_num(markers.positions)
+    return markers.unit == "m" and not x[..., 2].any() and float(abs(x).max()) > _MIN_PIXELS
+
+
+def is_in_pixels(path: Path) -> bool:
+    """Whether a file is a TRC whose points are pixels of an image."""
+    try:
+        return path.suffix.lower() == ".trc" and _is_of_image(_read_trc(path, None))
+    except KinefitError:
+        return False
 
 
 def _of_one_unit(markers: Markers) -> Markers:

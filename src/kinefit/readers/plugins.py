@@ -1,4 +1,4 @@
-"""What other distributions add to kinefit by entry points: records in tables of names, beside kinefit's own.
+"""What other distributions add to kinefit by entry points: records in tables of names, in addition to kinefit's own.
 
 A record is imported when its name is used. Kinds of sensors are in the group `kinefit.sensors`, formats of motions in
 `kinefit.exporters`, formats of files that are read in `kinefit.readers`.
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 PLUGIN_COMMENT = "of the plug-in "
-"""Begin of the comment that `kinefit init` writes beside the name of a plug-in; its distribution follows."""
+"""Begin of the comment that `kinefit init` writes after the name of a plug-in; its distribution follows."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Extension:
 
     @property
     def comment(self) -> str:
-        """What stands beside its name where `kinefit init` writes it."""
+        """What follows its name where `kinefit init` writes it."""
         return self.summary if self.plugin is None else f"{PLUGIN_COMMENT}{self.plugin.version}: {self.summary}"
 
     def fault(self, name: str) -> str:
@@ -316,8 +316,14 @@ class FileFormats(Extensions[FileFormat]):
 
 KEYPOINTS = FileFormats("kinefit.readers", FileFormat, "keypoint format", {
     "openpose": "kinefit.readers.landmarks.keypoints:OPENPOSE",
+    "alphapose": "kinefit.readers.landmarks.results:ALPHAPOSE",
+    "mmpose": "kinefit.readers.landmarks.results:MMPOSE",
     "mediapipe": "kinefit.readers.landmarks.keypoints:MEDIAPIPE",
+    "deeplabcut": "kinefit.readers.landmarks.named:DEEPLABCUT",
+    "sleap": "kinefit.readers.landmarks.named:SLEAP",
+    "freemocap": "kinefit.readers.landmarks.keypoints:FREEMOCAP",
     "caliscope": "kinefit.readers.landmarks.keypoints:CALISCOPE",
+    "sports2d": "kinefit.readers.landmarks.named:SPORTS2D",
 }, _KINDS_OF_FILES[0])  # fmt: skip
 """Formats of keypoints, which take files name; the most informative confidence first."""
 

@@ -282,9 +282,7 @@ def resampled(motion: Motion, rate: float) -> Motion:
     ObservationError
         The rate is not positive.
     """
-    at = steps(len(motion), motion.rate, rate)
-    low = np.minimum(at.astype(int), len(motion) - 1)
-    high, share = np.minimum(low + 1, len(motion) - 1), at - low
+    low, high, share = steps(len(motion), motion.rate, rate)
     A, B = motion.Ts_world_root[low], motion.Ts_world_root[high]
     step = se3.log_so3(B[:, :3, :3] @ A[:, :3, :3].swapaxes(1, 2))
     R = se3.exp_so3(share[:, None] * step) @ A[:, :3, :3]
@@ -293,7 +291,7 @@ def resampled(motion: Motion, rate: float) -> Motion:
     ends = {name: (getattr(motion, name)[low], getattr(motion, name)[high]) for name in _QUALITIES}
     worse = {name: (np.maximum if name.endswith("std") else np.minimum)(*pair) for name, pair in ends.items()}
     return replace(
-        motion, rate=rate, times=motion.times[0] + np.arange(len(at)) / rate, Ts_world_root=se3.transform(R, origin),
+        motion, rate=rate, times=motion.times[0] + np.arange(len(low)) / rate, Ts_world_root=se3.transform(R, origin),
         angles=angles, residuals={}, **worse,
     )
 

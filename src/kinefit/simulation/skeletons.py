@@ -61,12 +61,10 @@ class BoneDirections:
 
     def resampled(self, rate: float) -> BoneDirections:
         """The bone directions at another rate [Hz], interpolated linearly."""
-        at = steps(len(self), self.rate, rate)
-        low = np.minimum(at.astype(int), len(self) - 1)
-        high, share = np.minimum(low + 1, len(self) - 1), (at - low)[:, None]
+        low, high, share = steps(len(self), self.rate, rate)
 
         def between(array: NDArray) -> NDArray:
-            return (1 - share) * array[low] + share * array[high]
+            return (1 - share[:, None]) * array[low] + share[:, None] * array[high]
 
         return replace(
             self, rate=rate, hip_centre=between(self.hip_centre),
@@ -75,8 +73,8 @@ class BoneDirections:
         )  # fmt: skip
 
 
-def steps(frames: int, rate: float, new_rate: float) -> NDArray:
-    """(N,) positions of the frames at a new rate [Hz] among the old ones (0 .. frames - 1) at `rate` [Hz].
+def steps(frames: int, rate: float, new_rate: float) -> tuple[NDArray, NDArray, NDArray]:
+    """The old frames (N,) int before and after each frame at a new rate [Hz], and the share (N,) of the latter.
 
     Raises
     ------
@@ -85,7 +83,9 @@ def steps(frames: int, rate: float, new_rate: float) -> NDArray:
     """
     if not 0 < new_rate < np.inf:
         raise ObservationError(f"the rate {new_rate} is not positive", remedy="Give frames per second.")
-    return np.arange(int((frames - 1) / rate * new_rate + 1e-6) + 1) * (rate / new_rate)
+    at = np.arange(int((frames - 1) / rate * new_rate + 1e-6) + 1) * (rate / new_rate)
+    low = np.minimum(at.astype(int), frames - 1)
+    return low, np.minimum(low + 1, frames - 1), at - low
 
 
 def bone_directions(skeleton: SkeletonMotion, names: Mapping[str, str] | None = None) -> BoneDirections:

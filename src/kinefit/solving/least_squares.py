@@ -90,10 +90,22 @@ class Descent(Generic[At]):
     damping: float
 
 
+@dataclass(frozen=True)
+class Damping:
+    """First λ of `descend`, the least, and the λ at which the search ends, in the unit of its steps."""
+
+    first: float
+    least: float = _kernels_linear.LEAST_DAMPING
+    most: float = MAX_DAMPING
+
+    def times(self, mean: float) -> Damping:
+        """The same of steps whose λ is absolute, for shares of H's mean diagonal (a number in H's unit)."""
+        return Damping(self.first * mean, self.least * mean, self.most * mean)
+
+
 def descend(
     at: At, solve: Callable[[At, float], tuple[Move, float]], follow: Callable[[At, Move], At | None], *,
-    iterations: int, tolerance: float, damping: float, nothing: float = 1e-300,
-    least: float = _kernels_linear.LEAST_DAMPING, most: float = MAX_DAMPING, last: bool = False,
+    iterations: int, tolerance: float, damping: Damping, nothing: float = 1e-300, last: bool = False,
 ) -> Descent[At]:  # fmt: skip
     """Minimise a cost by damped Gauss-Newton steps, their damping adapted by Nielsen's rule.
 
@@ -104,28 +116,28 @@ def descend(
     follow : (problem, step) -> the problem after the step; None if that is impossible
     iterations : number of steps tried, at most
     tolerance, nothing : stop when the predicted fall of the cost is below this share of it plus `nothing`
-    damping, least, most : first λ, the least, and the λ at which the search ends, in the unit of `solve`
+    damping : of `solve`
     last : whether the step that ends it is taken, too
     """
-    growth = 2.0
+    now, growth = damping.first, 2.0
     for tried in range(1, iterations + 1):
-        move, predicted = solve(at, damping)
+        move, predicted = solve(at, now)
         if predicted < 0.0:
-            damping, growth = _kernels_linear.adapt(damping, growth, -1.0, 1.0, least)
+            now, growth = _kernels_linear.adapt(now, growth, -1.0, 1.0, damping.least)
             continue
         converged = predicted <= tolerance * at.cost + nothing
         if converged and not last:
-            return Descent(at, tried, True, damping)
+            return Descent(at, tried, True, now)
         new = follow(at, move)
         fall = -1.0 if new is None else at.cost - new.cost
-        damping, growth = _kernels_linear.adapt(damping, growth, fall, predicted, least)
+        now, growth = _kernels_linear.adapt(now, growth, fall, predicted, damping.least)
         if new is not None and fall > 0.0:
             at = new
         else:
-            converged |= damping > most
+            converged |= now > damping.most
         if converged:
-            return Descent(at, tried, True, damping)
-    return Descent(at, iterations, False, damping)
+            return Descent(at, tried, True, now)
+    return Descent(at, iterations, False, now)
 
 
 def _step(eq: Equations, damping: float, bounds: tuple[NDArray, NDArray], locked: NDArray) -> tuple[NDArray, float]:
@@ -231,6 +243,6 @@ def fitted(
     least = _kernels_linear.LEAST_DAMPING * mean
     end = descend(
         start, solve, follow, iterations=iterations, tolerance=tolerance, nothing=1e-16 * start.cost,
-        damping=0.1 * mean if damping is None else max(damping, least), least=least, most=1e16 * mean,
+        damping=Damping(0.1 * mean if damping is None else max(damping, least), least, 1e16 * mean),
     )  # fmt: skip
     return Fit(end.at.state, end.at, end.iterations, end.converged, end.damping)

@@ -35,8 +35,8 @@ def check_take(
 ) -> Checked:
     """Find all faults of a take, as `kinefit check` does.
 
-    What the take lacks is found first and kept beside it (`prepared`): keypoints, cameras, clocks. Files that cannot be
-    read, and images that do not fit their calibration, become findings; the check goes on without them.
+    What the take lacks is found first and kept next to it (`prepared`): keypoints, cameras, clocks. Files that cannot
+    be read, and images that do not fit their calibration, become findings; the check goes on without them.
 
     Parameters
     ----------

@@ -45,7 +45,7 @@ class InView:
     ----------
     seen : Observations
     people : in order of decreasing visibility; empty if only one was ever detected
-    depth : of each of them, some depth images by step that show nobody else; empty where keypoints tell who is there
+    depth : of each of them, some depth images by step that show this person alone; empty if keypoints tell people apart
     starts : of each of them step and state to begin with, likewise
     floors : the floor that the first tracked person stands on, once it is found: the others share that world
     """
@@ -88,7 +88,7 @@ class InView:
         return replace(recording, depth=self.depth[number], start=self.starts[number], followed=who)
 
     def _motion(self, k: int, recording: Recording, body: Body, settings: TrackSettings) -> Motion | None:
-        """Of one person, roughly: from keypoints alone, or from depth as if nobody else were there; None if lost."""
+        """Of one person, roughly: from keypoints alone, or from depth as if this person were alone; None if lost."""
         if k not in self._motions:
             try:
                 if self.depth:

@@ -34,7 +34,7 @@ _SCALED = "Resized to the stated height"
 
 
 def cameras_file(take: Path) -> Path:
-    """Where the cameras that were found for a take file are kept: TAKE-cameras.toml beside it."""
+    """Where the cameras that were found for a take file are kept: TAKE-cameras.toml next to it."""
     return take.with_name(f"{take.stem}-cameras.toml")
 
 
@@ -43,7 +43,7 @@ def prepared(take: Take, progress: Step | None = None, tell: Tell = warn, *, len
 
     The built-in detector looks through the videos of a take that names no keypoints, nor another sensor that shows a
     body, or that asks for it. Cameras of a take without calibration are found from the people in view. So are faces,
-    where the take hides them. All is kept beside the take and not sought again. A body that has to be fetched is.
+    where the take hides them. All is kept next to the take and not sought again. A body that has to be fetched is.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def find_cameras(
     """The take with cameras where the people in view put them; as it is where it has a calibration, or one camera.
 
     Keypoints are detected first where it names none. Lenses, places and clocks are found together (`calibrate_people`)
-    and written beside the take, TAKE-cameras.toml. They belong to the take from then on: steps, views or a person that
+    and written next to the take, TAKE-cameras.toml. They belong to the take from then on: steps, views or a person that
     it leaves out, sides that it exchanges, another body keep them; another height resizes them. They are found anew
     where a camera's keypoints, lens, clock or the vertical changed, or the file was deleted.
 

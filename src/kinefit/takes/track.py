@@ -47,7 +47,7 @@ def track_take(
 ) -> tuple[Motion, Observations]:
     """Track the person of a take file in all that its sensors saw, as `kinefit track` does; arguments as of `track`.
 
-    What the take lacks is found first and kept beside it (`prepared`): keypoints, cameras, clocks. Returns the motion
+    What the take lacks is found first and kept next to it (`prepared`): keypoints, cameras, clocks. Returns the motion
     and what the sensors saw (for overlays), with cameras where the fit found them. `view`: who is in view, where
     `people_in_view` has looked before.
     `provenance["findings"]` has the faults of images, cameras and keypoints that a quick check finds, always.

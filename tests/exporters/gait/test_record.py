@@ -142,7 +142,7 @@ def sitting():
 @pytest.mark.parametrize(
     ("motion", "reason"),
     [(sitting, "sits"), (lambda: squat_and_wave(), "no foot steps"), (lambda: replace(walk(), up="z"), "z is not up"),
-     (lambda: replace(walk(), quality=np.zeros(600)), "nobody was seen"),
+     (lambda: replace(walk(), quality=np.zeros(600)), "no person was observed"),
      (lambda: cut(walk(), 0, 30), "no (foot|two)"),
      (lambda: known_motion(load_body("arm"), RATE, np.tile(np.eye(4), (9, 1, 1)), np.zeros((9, 6))), "no landmarks")],
 )  # fmt: skip

@@ -100,7 +100,7 @@ def test_of_several_people_who_load_a_plate_none_has_it(walk, between):
     heel = walk.positions(walk.body.landmarks.select(("l_heel", "l_metatarsal_phalanx_1"))) + way
     other = Markers(("Bert:LHEE", "Bert:LTOE"), walk.rate, heel, first_time=float(walk.times[0]))
     plates, (said,) = stood_on(shared, [other])
-    assert plates == () and said.severity == "note" and f"{plate.name} is given to nobody" in said.text
+    assert plates == () and said.severity == "note" and f"{plate.name} is assigned to no person" in said.text
     elsewhere = replace(other, positions=heel + np.array([2.0, 0.0, 0.0]))
     assert stood_on(shared, [elsewhere]) == ((shared.plates[0],), [])
     unseen = replace(other, positions=np.full_like(heel, np.nan))

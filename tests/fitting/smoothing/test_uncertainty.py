@@ -8,7 +8,7 @@ import pytest
 from kinefit.bodies import PointSet, load_body
 from kinefit.fitting.smoothing.sensor_noise import Pushes
 from kinefit.fitting.smoothing.shared_errors import SharedErrors
-from kinefit.fitting.smoothing.uncertainty import KeypointPriors, systematic_errors
+from kinefit.fitting.smoothing.uncertainty import Averaged, KeypointPriors, systematic_errors
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.subject.parameters import World
 from kinefit.fitting.subject.subject import CameraExtrinsics
@@ -54,12 +54,11 @@ def covariance(scene, noise, Sigma=None, cameras=None):
     known, layout = KeypointPriors.of(subject, channels, cameras), Layout(channels, subject.body)
     known = replace(known, covariance=np.zeros_like(known.covariance) if Sigma is None else Sigma)
     n = subject.body.tree.n_dofs
-    assumed, none = np.full(len(weight), SIGMA**2), no_others(n)
-    return systematic_errors(known, layout, state, weight, assumed, noise, SharedErrors.none(len(weight)), *none)
+    return systematic_errors(known, layout, state, weight, noise, SharedErrors.none(len(weight)), no_others(n))
 
 
 def no_others(n):
-    return np.zeros((n, n)), Pushes(*np.zeros((2, 0, n)), *np.zeros((2, n, n)))
+    return Pushes(np.zeros((n, n)), *np.zeros((2, 0, n)), *np.zeros((2, n, n)))
 
 
 def noise_of(channels, drift=0.0, shift=None):
@@ -96,8 +95,7 @@ def test_a_constant_error_changes_a_difference_of_frames_as_refitting_does(scene
     for frame in (20, 40):
         weight = channels.weight[frame]
         state = fit(subject.body, channels, channels.uv[frame], weight, MOTION.state(frame))
-        assumed = np.full(count, SIGMA**2)
-        one = systematic_errors(exact, layout, state, weight, assumed, noise, SharedErrors.none(count), *none)
+        one = systematic_errors(exact, layout, state, weight, noise, SharedErrors.none(count), none)
         np.testing.assert_allclose(one.constant @ one.constant.T, one.dofs, atol=1e-12)
         factors.append(one.constant)
         fits.append((frame, weight, state))
@@ -121,9 +119,9 @@ def test_white_errors_smaller_than_assumed_move_the_pose_less_as_refitting_does(
     layout, n = Layout(channels, subject.body), subject.body.tree.n_dofs
     none = no_others(n)
     known = KeypointPriors.of(subject, channels, None)
-    assumed = 1.0 / np.where(weight > 0, weight, np.inf)
+    assumed, shared = 1.0 / np.where(weight > 0, weight, np.inf), SharedErrors.none(len(weight))
     one, alone = (
-        systematic_errors(known, layout, state, weight, assumed, of, SharedErrors.none(len(weight)), *none, averaged=1)
+        systematic_errors(known, layout, state, weight, of, shared, none, Averaged(1, assumed))
         for of in (noise, replace(noise, jitter=np.sqrt(assumed)))
     )
     sure = np.sqrt(np.diag(one.alone))[6:] < 0.1  # what is nearly free is not linear
@@ -134,7 +132,7 @@ def test_white_errors_smaller_than_assumed_move_the_pose_less_as_refitting_does(
     assert np.median(told) < 0.6
     np.testing.assert_allclose(alone.white_dofs, 1.0, atol=1e-6)
     assert one.white_joints.shape == one.joints.shape and np.all((one.white_joints >= 0.2) & (one.white_joints <= 1.0))
-    smoothed = systematic_errors(known, layout, state, weight, assumed, noise, SharedErrors.none(len(weight)), *none)
+    smoothed = systematic_errors(known, layout, state, weight, noise, shared, none)
     np.testing.assert_array_equal(smoothed.white_dofs, 1.0)  # a fit of each frame, whose errors are not averaged
 
 

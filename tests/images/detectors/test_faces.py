@@ -7,8 +7,9 @@ import pytest
 
 from kinefit.errors import AssetError
 from kinefit.images.detectors.box_detector import Models
-from kinefit.images.detectors.detection import PersonDetection, detect_people
+from kinefit.images.detectors.detection import detect_people
 from kinefit.images.detectors.faces import FaceFinder, FaceLandmarks, FaceModels, around_face, around_head
+from kinefit.images.detectors.following import PersonDetection
 from kinefit.images.detectors.roi import Roi
 from kinefit.readers import assets
 from kinefit.readers.videos.video import Video

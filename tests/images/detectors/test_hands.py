@@ -7,7 +7,7 @@ import pytest
 
 from kinefit.errors import AssetError
 from kinefit.images.detectors.box_detector import Models
-from kinefit.images.detectors.detection import PersonDetection, detect_people
+from kinefit.images.detectors.detection import detect_people
 from kinefit.images.detectors.faces import (
     HANDS_ONLY_COLUMN,
     HandFollower,
@@ -16,6 +16,8 @@ from kinefit.images.detectors.faces import (
     around_hand,
     around_wrist,
 )
+from kinefit.images.detectors.following import PersonDetection
+from kinefit.images.detectors.layouts import BLAZEPOSE
 from kinefit.images.detectors.roi import Roi
 from kinefit.readers import assets
 from kinefit.readers.videos.video import Video
@@ -105,6 +107,8 @@ def test_hands_alone_are_found_by_their_palms_and_followed_without():
 
 
 class Nobody:
+    layout = BLAZEPOSE
+
     def find_people(self, image):
         return []
 

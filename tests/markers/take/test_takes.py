@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.scenes.marker_takes import CASES, broken, load, training, truth_of
+from benchmarks.scenes.marker_takes import CASES, broken, load, shares, training, truth_of
 
 from kinefit.bodies.marker_sets import placement
 from kinefit.errors import ObservationError
@@ -48,10 +48,7 @@ def truthful(model, labelled, wrong=()):
 
 def check(found, cut, labelled, model):
     """Shares of the seen labels that have the right name, and a wrong one."""
-    column = np.array([labelled.names.index(n) for n in model.labels])
-    named = np.where(found.column >= 0, cut.truth[np.arange(len(labelled))[:, None], found.column], -2)
-    seen = (cut.truth[:, :, None] == column).any(1)
-    return ((named == column) & seen).sum() / seen.sum(), ((found.column >= 0) & (named != column)).sum() / seen.sum()
+    return shares(found.column, cut, labelled, model.labels)
 
 
 def test_a_broken_take_is_whole_again(labelled, model):
@@ -208,8 +205,5 @@ def test_real_takes(data_dir, name):
     model = learn_model(training(case))
     cut = broken(take, 5)
     found = identify_take(model, cut.markers)
-    column = np.array([take.names.index(n) for n in model.labels])
-    named = np.where(found.column >= 0, cut.truth[np.arange(len(take))[:, None], found.column], -2)
-    seen = (cut.truth[:, :, None] == column).any(1)
-    assert ((named == column) & seen).sum() / seen.sum() > 0.998
-    assert ((found.column >= 0) & (named != column)).sum() / seen.sum() < 0.002
+    right, wrong = check(found, cut, take, model)
+    assert right > 0.998 and wrong < 0.002

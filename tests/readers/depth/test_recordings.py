@@ -235,7 +235,7 @@ def test_times_from_names_and_their_gaps(tmp_path):
     with pytest.raises(ObservationError, match=r"give 29\.85 Hz, not 15 Hz"):
         read_depth(tmp_path / "a", time_unit=0.001, rate=15)
     with pytest.raises(ObservationError, match="its rate is not stated"):
-        read_depth(tmp_path / "a", usual_rate=None)
+        read_depth(tmp_path / "a", default_rate=None)
 
 
 @pytest.mark.parametrize(("times", "frame"), [([0, 1, 1, 2, 3], 2), ([0, 3, 2, 4, 5], 2), ([0, 1, 2, np.nan, 4], 3)])

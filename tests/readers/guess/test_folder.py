@@ -223,7 +223,7 @@ def test_a_person_on_the_ceiling_is_no_certain_up(folder, motion, rig):
     assert 'up = "z": the person stands upright; but the cameras stand upright would give -z' in told
 
 
-@pytest.mark.parametrize("keypoint_set", ["BODY_25", "BODY_25B", "COCO_17", "HALPE_26"])
+@pytest.mark.parametrize("keypoint_set", ["BODY_25", "BODY_25B", "COCO_17", "COCO_18", "HALPE_26"])
 def test_the_set_follows_from_the_points(folder, motion, rig, keypoint_set):
     write_calibration(rig, folder / "calibration.toml")
     write_videos(folder, [f"{name}.mp4" for name in rig.names])
@@ -232,6 +232,98 @@ def test_the_set_follows_from_the_points(folder, motion, rig, keypoint_set):
     take, seen, _ = taken(folder)
     assert [(k.camera, k.set, k.format) for k in take.keypoints] == [(n, keypoint_set, "openpose") for n in rig.names]
     assert seen.keypoints[0].names == KEYPOINT_SETS[keypoint_set]
+
+
+def write_alphapose(path, data):
+    people = [{"image_id": f"{i}.jpg", "category_id": 1, "keypoints": row.ravel().tolist(), "score": 2.5}
+              for i, row in enumerate(data)]  # fmt: skip
+    path.with_suffix(".json").write_text(json.dumps(people))
+
+
+def write_mmpose(path, data):
+    frames = [{"frame_id": i, "instances": [{"keypoints": row[:, :2].tolist(), "keypoint_scores": row[:, 2].tolist()}]}
+              for i, row in enumerate(data)]  # fmt: skip
+    path.with_suffix(".json").write_text(json.dumps(frames))
+
+
+def write_deeplabcut(path, data):
+    names = [name for name in KEYPOINT_SETS["COCO_17"] for _ in range(3)]
+    heads = [["scorer", *51 * ["net"]], ["bodyparts", *names], ["coords", *17 * ["x", "y", "likelihood"]]]
+    rows = [[k, *row.ravel()] for k, row in enumerate(data)]
+    path.with_suffix(".csv").write_text("\n".join(",".join(map(str, row)) for row in heads + rows))
+
+
+def write_sleap(path, data):
+    columns = ",".join(f"{name}.{axis}" for name in KEYPOINT_SETS["COCO_17"] for axis in ("x", "y", "score"))
+    rows = [f",{k},0.9," + ",".join(map(str, row.ravel())) for k, row in enumerate(data)]
+    path.with_suffix(".csv").write_text("\n".join([f"track,frame_idx,instance.score,{columns}", *rows]))
+
+
+WRITERS = {"alphapose": write_alphapose, "mmpose": write_mmpose, "deeplabcut": write_deeplabcut, "sleap": write_sleap}
+
+
+@pytest.mark.parametrize("format", WRITERS)
+def test_files_of_other_programs(folder, motion, rig, format):
+    write_calibration(rig, folder / "calibration.toml")
+    write_videos(folder, [f"{name}.mp4" for name in rig.names])
+    records = simulate_keypoints(motion, rig, "COCO_17", noise_px=1.5)
+    for record in records:
+        data = np.nan_to_num(np.concatenate([record.points[:, 0], record.confidence[:, 0, :, None]], -1))
+        WRITERS[format](folder / record.camera, data)
+    take, seen, guess = taken(folder)
+    assert [(k.camera, k.format) for k in take.keypoints] == [(name, format) for name in rig.names]
+    assert f"{format}, COCO_17, 4 cameras: used" in notes(guess)
+    for own, record in zip(seen.keypoints, records):
+        np.testing.assert_allclose(own.points, record.points[: len(own)], atol=1e-9)
+
+
+def test_one_video_and_its_keypoints_without_a_calibration(folder, motion, rig):
+    write_video(folder / "cam1.mp4")
+    record = simulate_keypoints(motion, rig, "COCO_17")[0]
+    write_alphapose(folder / "results", np.nan_to_num(np.dstack([record.points[:, 0], record.confidence[:, 0]])))
+    guess = guess_take(folder)
+    assert "open keypoints: results.json: not used without a calibration of its camera" in notes(guess)
+    assert "[[keypoints]]" not in guess.text and 'video = "cam1.mp4"' in guess.text
+    write_video(folder / "cam2.mp4")
+    with pytest.raises(CalibrationError, match="no calibration of the cameras"):
+        guess_take(folder)
+
+
+def test_arrays_of_freemocap(folder, motion, rig):
+    rig = renamed(rig, [f"cam_{k}" for k in range(len(rig))])
+    write_calibration(rig, folder / "calibration.toml")
+    write_videos(folder, [f"synchronized_videos/Camera_{k:03d}_synchronized.mp4" for k in range(len(rig))])
+    records = simulate_keypoints(motion, rig, "MEDIAPIPE_33", noise_px=1.0)
+    data = np.full((len(rig), 30, 553, 3), np.nan)
+    data[:, :, :33, :2] = [record.points[:, 0] for record in records]
+    (folder / "output_data").mkdir()
+    np.save(folder / "output_data" / "mediapipe2dData_numCams_numFrames_numTrackedPoints_pixelXY.npy", data)
+    np.save(folder / "output_data" / "mediapipe3dData_numFrames_numTrackedPoints_spatialXYZ.npy", data[0])
+    take, seen, guess = taken(folder)
+    assert [(k.camera, k.format) for k in take.keypoints] == [(name, "freemocap") for name in rig.names]
+    assert "mediapipe3dData_numFrames_numTrackedPoints_spatialXYZ.npy: an array of shape (30, 553, 3)" in notes(guess)
+    for own, record in zip(seen.keypoints, records):
+        np.testing.assert_allclose(own.points[:, :, :33], record.points)
+
+
+def test_a_project_of_pose2sim(folder, motion, rig):
+    """Calibration, videos, and the folders of its steps, of which that with all people at one clock is used."""
+    (folder / "calibration").mkdir()
+    write_calibration(rig, folder / "calibration" / "Calib.toml")
+    write_videos(folder / "videos", [f"{name}.mp4" for name in rig.names])
+    (folder / "Config.toml").write_text("[project]\nframe_rate = 30\n")
+    for step in ("pose", "pose-sync", "pose-associated"):
+        for record in simulate_keypoints(motion, rig, "HALPE_26", noise_px=1.5):
+            write_openpose(folder / step / f"{record.camera}_json", record)
+    empty = next((folder / "pose-associated" / f"{rig.names[0]}_json").iterdir())
+    empty.write_text(json.dumps({"people": [{}]}))
+    assert {k.file.parts[-2] for k in taken(folder)[0].keypoints} == {"pose-sync"}
+    for step in ("pose-sync", "pose"):
+        for file in (folder / step).rglob("*.json"):
+            file.unlink()
+        left = {k.file.parts[-2] for k in taken(folder)[0].keypoints}
+        assert left == {"pose" if step == "pose-sync" else "pose-associated"}
+    assert {k.set for k in taken(folder)[0].keypoints} == {"HALPE_26"}
 
 
 @pytest.mark.parametrize("body_set", ["BODY_25", "BODY_25B"])
@@ -412,12 +504,12 @@ def test_keypoints_of_which_none_can_be_used(folder, motion, rig):
         write_openpose(folder / record.camera, record)
     for file in folder.rglob("*.json"):  # a set that nobody knows
         text = json.loads(file.read_text())
-        text["people"][0]["pose_keypoints_2d"] += [0.0] * 3
+        text["people"][0]["pose_keypoints_2d"] += [0.0] * 6
         file.write_text(json.dumps(text))
     write_mediapipe(folder, motion, rig, [f"{name}.npy" for name in rig.names])
     take = read_guess(folder)
     assert {k.format for k in take.keypoints} == {"mediapipe"}
-    assert "18 points; there are sets of 17, 25, 26, 33, 67, 75, 133" in notes(guess_take(folder))
+    assert "19 points; there are sets of 17, 18, 25, 26, 33, 67, 75, 133" in notes(guess_take(folder))
 
 
 def test_keypoints_of_another_recording_are_left_out(folder, motion, rig):

@@ -38,6 +38,13 @@ def test_what_is_written_is_read(found, tmp_path):
     for wrong, problem in (([0.0, 0.1], "times of camera left"), ([0.0, 0.1, 0.1], "do not increase")):
         with pytest.raises(ObservationError, match=problem):
             replace(found, times=wrong)
+    assert read.looked is None
+    write_detections(replace(found, looked=[True, False, True]), path)
+    assert read_detections(path).looked.tolist() == [True, False, True]
+    assert read_detections(path).keypoints().looked.tolist() == [True, False, True]
+    assert read_detections(path).within(1, 5).looked.tolist() == [True, True, False, True, True]
+    with pytest.raises(ObservationError, match="looks of camera left"):
+        replace(found, looked=[True])
     bare = replace(found, lifted=None)
     write_detections(bare, path, key="the key")
     assert read_detections(path).lifted is None

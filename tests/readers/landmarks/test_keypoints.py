@@ -1,6 +1,7 @@
 """Keypoints of detectors: real folders and arrays, and every bad file named."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.observations import Keypoints
 from kinefit.readers.guess.files import find_keypoints
-from kinefit.readers.landmarks.keypoint_sets import KEYPOINT_SETS, SPLIT, keypoint_names
+from kinefit.readers.landmarks.keypoint_sets import KEYPOINT_SETS, keypoint_names
 from kinefit.readers.landmarks.keypoints import (
     read_caliscope_csv,
     read_keypoints,
@@ -41,7 +42,7 @@ def read(folder, **options):
 def test_sets_have_the_detectors_sizes_and_unique_names():
     sizes = {name: len(names) for name, names in KEYPOINT_SETS.items()}
     assert sizes == {
-        "BODY_25B": 25, "BODY_25": 25, "COCO_17": 17, "HALPE_26": 26, "MEDIAPIPE_33": 33,
+        "BODY_25B": 25, "BODY_25": 25, "COCO_17": 17, "COCO_18": 18, "HALPE_26": 26, "MEDIAPIPE_33": 33,
         "BODY_25_HANDS": 67, "COCO_WHOLEBODY_133": 133, "MEDIAPIPE_75": 75, "MEDIAPIPE_478": 478,
     }
     assert all(len(set(names)) == len(names) for names in KEYPOINT_SETS.values())
@@ -293,8 +294,8 @@ def test_any_format(data_dir, tmp_path):
     by_kind = read_keypoints(folder / "openpose_json" / "cam03", camera="cam03", rate=60)
     assert by_kind.keypoint_set == "BODY_25B"
     assert read_keypoints(folder / "mediapipe_landmarks_cam03.npy", camera="c", rate=60).keypoint_set == "MEDIAPIPE_33"
-    with pytest.raises(ObservationError, match="no keypoint format 'alphapose'; there are: openpose, mediapipe"):
-        read_keypoints(tmp_path, format="alphapose", camera="c", rate=60)
+    with pytest.raises(ObservationError, match="no keypoint format 'theia'; there are: openpose, alphapose"):
+        read_keypoints(tmp_path, format="theia", camera="c", rate=60)
 
 
 def depths(rng, shape):
@@ -389,7 +390,7 @@ def people_of(keypoint_set, folder, order=None):
     return write(folder, {i: [{"pose_keypoints_2d": frame.ravel().tolist()}] for i, frame in enumerate(rows)})
 
 
-@pytest.mark.parametrize("keypoint_set", ["BODY_25", "BODY_25B", "COCO_17", "HALPE_26"])
+@pytest.mark.parametrize("keypoint_set", ["BODY_25", "BODY_25B", "COCO_17", "COCO_18", "HALPE_26"])
 def test_the_set_follows_from_the_number_of_points_and_the_bones(tmp_path, keypoint_set):
     folder = people_of(keypoint_set, tmp_path / "json")
     seen = read_openpose(folder, camera="c", rate=30)
@@ -411,32 +412,120 @@ def test_openpose_s_own_model_without_a_set(data_dir):
     assert [k.keypoint_set for k in seen.keypoints] == 4 * ["BODY_25"]
 
 
-COCO = {"category_id": 1, "keypoints": [1.0, 2.0, 0.9] * 17}
-RESULTS = {  # the start of a file: what it is
-    "alphapose.json": (json.dumps([{"image_id": "0.jpg"} | COCO]), "AlphaPose"),
-    "coco.json": (json.dumps([COCO | {"image_id": 7, "score": 1}]), "COCO"),
-    "by_image.json": (json.dumps({"0.jpg": {"version": 0.1, "bodies": [{"joints": [1.0, 2.0, 0.9]}]}}), "AlphaPose"),
-    "mmpose.json": (json.dumps([{"frame_id": 0, "instances": [{"keypoints": [[1.0, 2.0]]}]}]), "MMPose"),
-    "dlc.csv": ("scorer,net,net,net\nbodyparts,nose,nose,nose\ncoords,x,y,likelihood\n0,1,2,0.9\n", "DeepLabCut"),
+OTHERS = {  # a file that no reader takes: what is said of it
+    "annotations.json": (b'{"images": [{"file_name": "a.jpg"}], "annotations": []}', "COCO's annotations"),
+    "tracks.h5": (b"\x89HDF\r\n\x1a\nand nothing more", "HDF5, of which DeepLabCut's and SLEAP's is read"),
+    "table.csv": (b"a,b\n1,2\n", "a file of another kind"),
+    "notes.json": (b'{"notes": 3}', "a file of another kind"),
 }
 
 
-@pytest.mark.parametrize("name", RESULTS)
-def test_files_of_other_programs_are_said_for_what_they_are(tmp_path, name):
-    text, program = RESULTS[name]
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_file_that_no_reader_takes_is_said_for_what_it_is(tmp_path, name):
+    content, said = OTHERS[name]
     path = tmp_path / name
-    path.write_text(text)
-    for format in ("openpose", None, "mediapipe"):
-        with pytest.raises(ObservationError, match=f"{program}.*which are not read") as caught:
-            read_keypoints(path, format=format, camera="c", rate=30.0)
-        assert caught.value.file == path and "pose_keypoints_2d" in caught.value.remedy
-    what = caught.value.problem.removesuffix(", which are not read")
-    assert find_keypoints([path], [])[1] == [f"{name}: {what}; not used. {SPLIT}"]
+    path.write_bytes(content)
+    with pytest.raises(ObservationError, match=f"{said}.*no keypoints of a known form") as caught:
+        read_keypoints(path, camera="c", rate=30.0)
+    assert caught.value.file == path and "AlphaPose, MMPose" in caught.value.remedy
+    if "another kind" in said:
+        assert find_keypoints([path], []) == ([], [])
+    else:
+        (remark,) = find_keypoints([path], [])[1]
+        assert remark.startswith(f"{name}: ") and said in remark and "not used" in remark
+        with pytest.raises(ObservationError, match=f"{said}.*no keypoints of a known form"):
+            read_keypoints(path, format="mediapipe", camera="c", rate=30.0)
 
 
-def test_alphapose_s_results_beside_a_video(data_dir):
+@pytest.mark.parametrize("format", [None, "sleap", "deeplabcut"])
+def test_hdf5_without_the_package_that_reads_it(tmp_path, monkeypatch, format):
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["node_names"] = [1.0]
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(ObservationError, match=r"read with the package h5py \(kinefit\[hdf5\]\)"):
+        read_keypoints(path, format=format, camera="c", rate=30.0)
+    found, (remark,) = find_keypoints([path], [])
+    assert not found and "kinefit[hdf5]" in remark
+
+
+def test_alphapose_s_results_named_as_openpose(data_dir):
     path = data_dir("cases_of_users") / "keypoints-alphapose-results" / "alphapose-results.json"
     for named in (path, path.parent):
-        with pytest.raises(ObservationError, match="AlphaPose's or COCO's results, a list of all frames'") as caught:
+        with pytest.raises(ObservationError, match="all frames' people by AlphaPose.*not openpose") as caught:
             read_openpose(named, camera="c", rate=30.0)
-        assert caught.value.file == path
+        assert caught.value.file == path and 'format = "alphapose"' in caught.value.remedy
+
+
+OLD = {"pose_keypoints_2d": "pose_keypoints", "hand_left_keypoints_2d": "hand_left_keypoints"}
+
+
+def test_keys_of_older_versions(tmp_path):
+    people = [person(25) | {"hand_left_keypoints_2d": [7.0, 8.0, 0.5] * 21}]
+    new = read(write(tmp_path / "new", {0: people}), keypoint_set="BODY_25_HANDS")
+    old = read(write(tmp_path / "old", {0: [{OLD.get(k, k): v for k, v in people[0].items()}]}), keypoint_set=None)
+    assert old.keypoint_set in ("BODY_25", "BODY_25B") and old.points.shape == (1, 1, 25, 2)
+    old = read(tmp_path / "old", keypoint_set="BODY_25_HANDS")
+    np.testing.assert_array_equal(old.points, new.points)
+    np.testing.assert_array_equal(old.confidence, new.confidence)
+    assert new.confidence[0, 0, 25:46].tolist() == [0.5] * 21
+    (tmp_path / "cmu").mkdir()
+    for i in range(2):  # AlphaPose's form "cmu", one file an image
+        frame = {"version": "AlphaPose v0.3", "bodies": [{"joints": [100.0, 101.0, 0.9] * 18}] * i}
+        (tmp_path / "cmu" / f"{i}.json").write_text(json.dumps(frame))
+    cmu = read(tmp_path / "cmu", keypoint_set=None)
+    assert cmu.keypoint_set == "COCO_18" and np.isfinite(cmu.points[:, 0, 0, 0]).tolist() == [False, True]
+
+
+def test_people_that_pose2sim_did_not_associate(tmp_path):
+    """`pose-associated` has an empty object in the place of a person that a camera does not see."""
+    seen = read(write(tmp_path / "json", {0: [{}, person(value=5)], 1: [{}, {}], 2: [person(value=7), {}]}))
+    assert seen.points.shape == (3, 1, 17, 2) and seen.points[[0, 2], 0, 0, 0].tolist() == [5, 7]
+    assert not seen.confidence[1].any()
+    with pytest.raises(ObservationError, match="broken json.*pose_keypoints_2d"):
+        read(write(tmp_path / "other", {0: [{"face_keypoints_2d": []}]}))
+
+
+def freemocap(cameras=2, frames=4, points=553):
+    data = np.random.default_rng(0).uniform(100.0, 600.0, (cameras, frames, points, 3))
+    data[..., 2] = -50.0  # a depth
+    data[1, 2] = np.nan
+    data[0, 1, 33:54] = np.nan  # the right hand
+    return data
+
+
+@pytest.mark.parametrize("points", [33, 75, 553])
+def test_freemocap(tmp_path, points):
+    data = freemocap(points=points)
+    path = tmp_path / "mediapipe2dData_numCams_numFrames_numTrackedPoints_pixelXY.npy"
+    np.save(path, data)
+    seen = read_keypoints(path, camera="Camera_001", rate=30.0)
+    assert (seen.camera, seen.rate) == ("Camera_001", 30.0)
+    assert seen.keypoint_set == ("MEDIAPIPE_33" if points == 33 else "MEDIAPIPE_75")
+    assert not seen.confidence[2].any() and (seen.confidence[[0, 1, 3]] == 1.0).all()
+    np.testing.assert_array_equal(seen.points[0, 0, :33], data[1, 0, :33, :2])
+    first = read_keypoints(path, camera="cam_0", rate=30.0)
+    if points > 33:
+        at = [first.names.index(name) for name in ("left_hand_wrist", "right_hand_wrist")]
+        np.testing.assert_array_equal(first.points[0, 0, at], data[0, 0, [54, 33], :2])
+        assert first.confidence[1, 0, at].tolist() == [1.0, 0.0]
+    if points == 553:
+        face = read_keypoints(path, camera="cam_0", rate=30.0, keypoint_set="MEDIAPIPE_478")
+        np.testing.assert_array_equal(face.points[0, 0], data[0, 0, 75:, :2])
+    else:
+        with pytest.raises(ObservationError, match="landmarks have shape"):
+            read_keypoints(path, camera="cam_0", rate=30.0, keypoint_set="MEDIAPIPE_478")
+    with pytest.raises(ObservationError, match="no camera in this file named 'Camera_7'; there are: cam_0, cam_1"):
+        read_keypoints(path, camera="Camera_7", rate=30.0)
+    found, _ = find_keypoints([path], [])
+    assert [(k.format, k.frames, k.points) for k in found] == [("freemocap", 4, points)]
+
+
+def test_freemocap_s_points_in_space_are_not_read(tmp_path):
+    path = tmp_path / "mediapipe3dData_numFrames_numTrackedPoints_spatialXYZ.npy"
+    np.save(path, freemocap()[0])
+    with pytest.raises(ObservationError, match=r"landmarks have shape \(4, 553, 3\)"):
+        read_keypoints(path, camera="cam_0", rate=30.0)
+    found, (remark,) = find_keypoints([path], [])
+    assert not found and "landmarks in images" in remark

@@ -135,3 +135,18 @@ def test_shifts_and_turns_that_cannot_be_are_refused(line, tmp_path):
     told = rf"1: {line.partition(' ')[0]} = \[.*\]. Give (metres|degrees, at most 360)"
     with pytest.raises(TakeError, match=told):
         read_take(file)
+
+
+KEYPOINTS = '[calibration]\nfile = "m.trc"\n[[camera]]\nname = "a"\n[[keypoints]]\ncamera = "a"\nfile = "m.trc"\n'
+
+
+def test_names_and_sets_of_points_with_names_of_their_own(tmp_path):
+    text = KEYPOINTS + 'format = "deeplabcut"\nset = "MOUSE"\nnames = { paw_l = "LPaw", tail = "" }\n'
+    (entry,) = take(tmp_path, text).keypoints
+    assert (entry.set, entry.names) == ("MOUSE", {"paw_l": "LPaw", "tail": ""})
+    with pytest.raises(TakeError, match="no keypoint set 'MOUSE'; there are: BODY_25B"):
+        take(tmp_path, KEYPOINTS + 'format = "mmpose"\nset = "MOUSE"\n')
+    with pytest.raises(TakeError, match="no keypoint set of freemocap 'COCO_17'; there are: MEDIAPIPE_33"):
+        take(tmp_path, KEYPOINTS + 'format = "freemocap"\nset = "COCO_17"\n')
+    with pytest.raises(TakeError, match="'names' has no use with format = \"alphapose\""):
+        take(tmp_path, KEYPOINTS + 'format = "alphapose"\nnames = { a = "LKnee" }\n')

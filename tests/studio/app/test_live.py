@@ -66,7 +66,7 @@ def test_a_session_shows_its_page_and_ends_when_it_is_told_to(copy_take, tmp_pat
         return queue, job, policy
 
     queue, job, policy = asyncio.run(asyncio.wait_for(scenario(), 300.0))
-    assert job.state in (DONE, PAUSED) and job.error is None and queue.beside == [job] and not queue.jobs
+    assert job.state in (DONE, PAUSED) and job.error is None and queue.sessions == [job] and not queue.jobs
     assert "frame-ancestors http://localhost:*" in policy
     out = take.with_name(job.command[job.command.index("--out") + 1].rpartition("/")[2])
     assert not list(out.glob("*.unfinished")) and recorded_take(job) is None  # keypoints are recorded already

@@ -279,7 +279,7 @@ def quality_ramp(values: ArrayLike) -> NDArray[np.uint8]:
 LOST_OPACITY, UNCERTAIN_OPACITY = 0.45, 0.6
 """Of the skin of segments that no measurement supports, and of those whose place is uncertain."""
 
-_MAX_SIGMA = 0.11  # [m] of a joint, all directions together, above which its limb may lie beside itself
+_MAX_SIGMA = 0.11  # [m] of a joint, all directions together, above which its limb may be drawn outside itself
 
 
 @dataclass(frozen=True, eq=False)

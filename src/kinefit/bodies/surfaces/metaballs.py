@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.surfaces.mesh import MAX_LENGTH, MeshSurface, tube_faces
 from kinefit.errors import BodyError
+from kinefit.geometry.lines import perpendiculars
 
 LEVEL = 0.5  # of the field on the surface (P4, w_t)
 _MIN_RADIUS = 1e-4  # [m] below what any sensor resolves
@@ -171,10 +172,8 @@ def _mesh(centres: NDArray, radii: NDArray, weights: NDArray, axes: NDArray) -> 
         at = np.round(middles[np.argmax(hollow)], 3).tolist()
         problem = f"metaballs do not join: their field is below 1/2 near {at} m"
         raise BodyError(problem, remedy="Give larger radii along the limb, or another ball between them.")
-    side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
-    side /= np.linalg.norm(side)
-    angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
-    ways = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(along, side)
+    angle, (side, across) = 2.0 * np.pi * np.arange(_AROUND) / _AROUND, perpendiculars(along)
+    ways = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * across
     starts = np.repeat(middles, _AROUND, axis=0)
     rays = np.tile(ways, (_RINGS, 1))
     rings = starts + _first_outside(starts, rays, 3.0 * float(radii.max()) + reach, balls)[:, None] * rays

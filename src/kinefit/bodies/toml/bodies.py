@@ -74,12 +74,12 @@ def _body(record: tables.FileRecord, source: str) -> Body:
         record.segment, record.landmarks, record.usual, record.coupling, record.morph, record.closure
     )  # fmt: skip
     if record.body.mirror:
-        segments = _beside(segments, lambda s: s.name.endswith("_r"))
+        segments = _with_mirror_images(segments, lambda s: s.name.endswith("_r"))
         others = {tables.left(n): tables.mirrored(p) for n, p in points.items()}
         points = points | {n: p for n, p in others.items() if n not in points}
         usual = {tables.left(n): v for n, v in usual.items()} | usual
         coupling, closure = tables.with_images(coupling), tables.with_images(closure)
-        morph = _beside(morph, lambda m: m.kind != "global" and tables.left(m.angle) != m.angle)
+        morph = _with_mirror_images(morph, lambda m: m.kind != "global" and tables.left(m.angle) != m.angle)
     segments = _in_order(segments)
     groups = tuple(dict.fromkeys(s.scale or s.name for s in segments))
     index = {s.name: i for i, s in enumerate(segments)}
@@ -134,8 +134,8 @@ def _record(text: str, source: str, above: tuple[str, ...] = ()) -> tables.FileR
         return tables.merged(_record(below, file, (*above, base)), record)
 
 
-def _beside(records: Iterable[Any], sided: Callable[[Any], bool]) -> list[Any]:
-    """Records, and beside each that is of the right side its image."""
+def _with_mirror_images(records: Iterable[Any], sided: Callable[[Any], bool]) -> list[Any]:
+    """Records, and after each of the right side its mirror image."""
     return [one for r in records for one in ((r, tables.mirrored(r)) if sided(r) else (r,))]
 
 

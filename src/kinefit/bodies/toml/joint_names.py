@@ -202,15 +202,11 @@ def _bones(family: str) -> dict[str, str]:
     return next(known.joints for known in FAMILIES if known.name == family)
 
 
-def _capitalised(names: Mapping[str, str]) -> dict[str, str]:
-    return {segment: name[0].upper() + name[1:] for segment, name in names.items()}
-
-
 _VRM_BONES = _bones("VRM, Unity") | {segment: names[0] for segment, names in FACE.items()}
 
 CHARACTER_BONES = {
     "vrm": _VRM_BONES | VRM1_FINGERS,
-    "unity": _capitalised(_VRM_BONES | VRM0_FINGERS),
+    "unity": {segment: name[0].upper() + name[1:] for segment, name in (_VRM_BONES | VRM0_FINGERS).items()},
     "unreal": _bones("Unreal") | _UNREAL_FINGERS,
 }
 """Convention -> segment of the humanoid -> bone: VRM 1, HumanBodyBones of Unity, the mannequin of Unreal."""

@@ -235,10 +235,12 @@ def refuse_repeated(what: str, names: Iterable[str]) -> None:
         raise BodyError(problem, remedy="Rename one of them.")
 
 
-_EXTENDS = {"MEDIAPIPE_75": "MEDIAPIPE_33", "BODY_25_HANDS": "BODY_25", "COCO_WHOLEBODY_133": "COCO_17"}
-"""Keypoint sets with hands, and the sets that they extend."""
+_EXTENDS = {
+    "MEDIAPIPE_75": "MEDIAPIPE_33", "BODY_25_HANDS": "BODY_25", "COCO_WHOLEBODY_133": "COCO_17", "COCO_18": "COCO_17",
+}  # fmt: skip
+"""Keypoint sets with hands or a neck, and the sets that they extend."""
 
 
 def extended(sets: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
-    """Keypoint sets of a file, and the sets that extend them, without hands if the body has no fingers."""
+    """Keypoint sets of a file, and the sets that extend them, without hands or neck if the body has none."""
     return sets | {name: sets[of] | sets.get(name, {}) for name, of in _EXTENDS.items() if of in sets}

@@ -216,7 +216,7 @@ def _plan(check: Checked) -> p.Section:
             outline = camera.centre_world + 0.45 * reach * np.stack([ends[0], np.zeros(3), ends[1]])
             bad = any(found.severity == "fault" for found in check.of(camera.name))
             colour = p.RIGHT_COLOUR if bad else p.LEFT_COLOUR
-            traces.append(p.line(outline @ a, outline @ b, camera.name, colour, 1))
+            traces.append(p.line(outline @ a, outline @ b, camera.name, p.Stroke(colour, 1)))
             traces.append({
                 "x": outline[1:2] @ a, "y": outline[1:2] @ b, "mode": "markers+text", "type": "scatter",
                 "text": [camera.name], "textposition": "top center", "showlegend": False,
@@ -236,7 +236,7 @@ def _plan(check: Checked) -> p.Section:
 
 def _times(check: Checked) -> p.Section:
     traces = [
-        p.line(shifts, cost, f"{a} - {b}", colour, 1.6, hover=f"{a} - {b} %{{y:.1f}} px", legend=True)
+        p.line(shifts, cost, f"{a} - {b}", p.Stroke(colour, 1.6), hover=f"{a} - {b} %{{y:.1f}} px", legend=True)
         for ((a, b), (shifts, cost)), colour in zip(check.times.curves.items(), cycle(p.SERIES))
     ]
     layout = {

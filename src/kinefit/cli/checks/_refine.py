@@ -79,7 +79,7 @@ def refined_of(found: Checked, step: Step, points: Path | None, **lenses_and_clo
 
 
 def write_refined(found: Checked, refined: Refined, path: Path) -> Path | None:
-    """Write the refined calibration beside the old one, and a copy of the take at `path` that uses it.
+    """Write the refined calibration next to the old one, and a copy of the take at `path` that uses it.
 
     Returns the copy; None where nothing changes.
 
@@ -104,17 +104,17 @@ def write_refined(found: Checked, refined: Refined, path: Path) -> Path | None:
     for entry in take.cameras:
         if abs(late.get(entry.name, 0.0)) > 1e-5:
             edits.append(Edit("camera", "time_offset", f"{entry.time_offset + late[entry.name]:.6f}", entry.name))
-    beside = free_name(path)
-    write_text(beside, edited(path.read_text("utf-8"), edits))
+    copy = free_name(path)
+    write_text(copy, edited(path.read_text("utf-8"), edits))
     try:
-        read_take(beside)
+        read_take(copy)
     except FileError as error:  # [calibration] twice: the take has it in another form
-        beside.unlink()
+        copy.unlink()
         remedy = f"Write it yourself: {in_words(edits, ' in ')}."
         raise TakeError("the refined file cannot be written into [calibration]", file=path, remedy=remedy) from error
-    _screen.say(f"\nWritten: {beside}, a copy of {path.name} with {in_words(edits, ' in ')}.")
-    _screen.say(f"Next:\n  {command('track', beside)}")
-    return beside
+    _screen.say(f"\nWritten: {copy}, a copy of {path.name} with {in_words(edits, ' in ')}.")
+    _screen.say(f"Next:\n  {command('track', copy)}")
+    return copy
 
 
 def _relative(path: Path, folder: Path) -> str:

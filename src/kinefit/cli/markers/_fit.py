@@ -110,14 +110,14 @@ def identify_file(
     step: Step | None = None,
     method: Callable[..., takes.TakeIdentification] = takes.identify_take,
 ) -> tuple[Markers, dict[str, takes.TakeIdentification], dict[str, Path]]:
-    """Name the markers of a file and write it with labels, with a table of doubtful frames beside it.
+    """Name the markers of a file and write it with labels, with a table of doubtful frames next to it.
 
     Parameters
     ----------
     path : C3D or TRC file; its labels, if it has any, are not looked at
     model : of the subject, or a file of it
         Several for several subjects, whose labels then bear their names ("Anna:C7").
-    out : .c3d or .trc, default beside the file: NAME-named with the same ending. A C3D of a C3D keeps its analog
+    out : .c3d or .trc, default next to the file: NAME-named with the same ending. A C3D of a C3D keeps its analog
         channels and parameters.
     unit : of files that state none or a wrong one
     rest : whether points that are unassigned are kept, as "*1", "*2" ...
@@ -151,7 +151,7 @@ def identify_file(
 def _together(
     models: list[MarkerModel], found: list[takes.TakeIdentification], markers: Markers, rest: bool
 ) -> Markers:
-    """One take of all subjects; with `rest` the points of nobody."""
+    """One take of all subjects; with `rest` unassigned points, too."""
     parts = [f.markers(markers) for f in found]
     if len(models) > 1:
         for i, model in enumerate(models):
@@ -243,7 +243,7 @@ def fit_file(
     Parameters
     ----------
     path : C3D or TRC file with labels; several people bear their names as prefixes ("Anna:LASI").
-    out : folder, default beside the file: NAME-kinefit; with several people one folder for each in it.
+    out : folder, default next to the file: NAME-kinefit; with several people one folder for each in it.
     unit : str, optional, of files that state none or a wrong one.
     formats : names of `FORMATS`, "markers" for the measured ones as OpenSim takes them, and "report".
     step : (what, done, total) -> None, called as the fit advances.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ from kinefit.cli import _screen
 from kinefit.cli._screen import CommandGroup
 
 if TYPE_CHECKING:
+    from kinefit.cli.markers._fit import MarkerFitOptions
     from kinefit.findings import Finding
     from kinefit.markers.take.takes import TakeIdentification
     from kinefit.observations import Markers
@@ -109,6 +111,17 @@ def write_set(takes: tuple[Path, ...], out: Path | None, name: str | None, unit:
     _screen.say(f"Next: check it, then kinefit markers learn {takes[0].name} --set {out}")
 
 
+def _method(method: str, **constants: float | None) -> Callable[..., TakeIdentification]:
+    """The identifier, or SAPM with its constants."""
+    from kinefit.markers.take.takes import identify_take
+    from kinefit.papers.unlabelled_markers import sapm_take
+
+    given: dict[str, Any] = {name: value for name, value in constants.items() if value is not None}
+    if given and method != "sapm":
+        raise click.UsageError(f"--{' and --'.join(given)}: only for SAPM, add --method sapm.")
+    return partial(sapm_take, **given) if method == "sapm" else identify_take
+
+
 @markers.command(epilog="""\b
 Examples:
   kinefit markers identify walk.c3d anna.json
@@ -129,9 +142,10 @@ Examples:
               help="SAPM: share of a segment's points that a match must exceed.  [default: 0.8]")
 @_unit
 @_screen.verbose_option
+@_screen.gathered("method", _method, "method", "epsilon", "beta")
 def identify(
-    take: Path, subjects: tuple[Path, ...], out: Path | None, fill: bool, rest: bool, method: str,
-    epsilon: float | None, beta: float | None, unit: str | None,
+    take: Path, subjects: tuple[Path, ...], out: Path | None, fill: bool, rest: bool,
+    method: Callable[..., TakeIdentification], unit: str | None,
 ) -> None:  # fmt: skip
     """Label the points of an unlabelled take.
 
@@ -139,18 +153,12 @@ def identify(
     ignored. Points without a certain label stay unlabelled. The worst doubtful frames are printed; a table lists all.
     """
     from kinefit.cli.markers._fit import identify_file
-    from kinefit.markers.take.takes import TakeSettings, identify_take
-    from kinefit.papers.unlabelled_markers import sapm_take
+    from kinefit.markers.take.takes import TakeSettings
 
-    given = (("epsilon", epsilon), ("beta", beta))
-    constants: dict[str, Any] = {name: value for name, value in given if value is not None}
-    if constants and method != "sapm":
-        raise click.UsageError(f"--{' and --'.join(constants)}: only for SAPM, add --method sapm.")
     settings = TakeSettings() if fill else TakeSettings(fill=0.0)
     with _screen.bars() as step:
         labelled, found, files = identify_file(
-            take, list(subjects), out, settings=settings, unit=unit, rest=rest, step=step,
-            method=partial(sapm_take, **constants) if method == "sapm" else identify_take,
+            take, list(subjects), out, settings=settings, unit=unit, rest=rest, step=step, method=method,
         )  # fmt: skip
     _tell(labelled, found)
     _screen.say("\nWritten:")
@@ -202,14 +210,17 @@ Examples:
               help="Formats to write.  [default: motion,csv,bvh,glb,trc,mot,osim,markers,report]")  # fmt: skip
 @_unit
 @_screen.verbose_option
+@_screen.gathered(
+    "options", "kinefit.cli.markers._fit:MarkerFitOptions",
+    "static", "body", "marker_set", "height", "mass", "up", "sides", "limits", "smooth",
+)  # fmt: skip
 def fit(
-    take: Path, out: Path | None, subjects: tuple[Path, ...], static: Path | None, body: str, marker_set: str | None,
-    height: float | None, mass: float | None, up: str | None, sides: str | None, limits: bool, smooth: bool,
-    formats: str | None, unit: str | None,
+    take: Path, out: Path | None, subjects: tuple[Path, ...], options: MarkerFitOptions, formats: str | None,
+    unit: str | None,
 ) -> None:  # fmt: skip
     """Fit a body to markers: size and marker offsets from all frames, then joint angles."""
     from kinefit.cli._summary import print_files, print_summary
-    from kinefit.cli.markers._fit import WRITTEN, MarkerFitOptions, fit_file, identify_file
+    from kinefit.cli.markers._fit import WRITTEN, fit_file, identify_file
 
     out = out or take.with_name(f"{take.stem}-kinefit")
     chosen = WRITTEN if formats is None else tuple(part.strip().lower() for part in formats.split(",") if part.strip())
@@ -220,8 +231,6 @@ def fit(
             target = out / f"{take.stem}-named.c3d"
             labelled, named, files = identify_file(take, list(subjects), target, unit=unit, step=step)
             source, unit = files["markers"], None
-        known = Path(body) if Path(body).suffix else body
-        options = MarkerFitOptions(known, static, marker_set, height, up, limits, sides, smooth, mass)
         notes: list[Finding] = []
         found = fit_file(source, out, options, unit=unit, formats=chosen, step=step, notes=notes)
     if subjects:

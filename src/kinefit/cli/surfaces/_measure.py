@@ -57,7 +57,7 @@ def read_views(calibration: Path, unit: str, views: Sequence[str], fewest: int =
     Raises
     ------
     ObservationError
-        Fewer than `fewest` views, one without a name, photographs beside videos, or other numbers of photographs.
+        Fewer than `fewest` views, one without a name, photographs mixed with videos, or other numbers of photographs.
     FileError
         A file or folder that is not there or holds no image.
     """

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from kinefit.cli import _screen
+
+if TYPE_CHECKING:
+    from kinefit.cli.surfaces._measure import Wanted
 
 
 @click.command(short_help="Measure a surface without a body: points, mesh, strain.", epilog="""\b
@@ -53,11 +57,13 @@ Examples:
 @click.option("--neighbours", is_flag=True, help="Videos: also reject points whose neighbours were rejected.")
 @click.option("--field", type=click.Choice(["odd", "even"]), help="Interlaced images: use only these lines.")
 @_screen.verbose_option
+@_screen.gathered(
+    "wanted", "kinefit.cli.surfaces._measure:Wanted",
+    "out", "window", "step", "mask", "seeds", "least", "gauge", "incremental", "still", "smooth", "motion", "bounds",
+    "bright", "reach", "neighbours", "field",
+)  # fmt: skip
 def surface(
-    calibration: Path, views: tuple[str, ...], out: Path, unit: str, window: str, step: int, mask: Path | None,
-    seeds: Path | None, least: float | None, gauge: float | None, incremental: bool, still: int | None,
-    smooth: float, flat: float | None, motion: Path | None, bounds: tuple[float, float] | None,
-    bright: int | None, reach: int | None, neighbours: bool, field: str | None,
+    calibration: Path, views: tuple[str, ...], unit: str, flat: float | None, wanted: Wanted
 ) -> None:  # fmt: skip
     """Measure a surface with two or more cameras: points with standard deviations, mesh, displacement, strain.
 
@@ -71,23 +77,14 @@ def surface(
     from kinefit.cli.surfaces import _measure
     from kinefit.errors import ObservationError
 
-    _screen.check_folder(out)
-    wanted = _measure.Wanted(
-        out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth, motion, bounds, neighbours,
-        bright, reach,
-    )  # fmt: skip
-    videos_alone = {
-        "--motion": motion, "--bounds": bounds, "--bright": bright, "--reach": reach, "--neighbours": neighbours or None
-    }  # fmt: skip
-    of_videos = [name for name, value in videos_alone.items() if value is not None]
-    source = click.get_current_context().get_parameter_source
-    stated = {f"--{n}" for n in ("window", "step") if source(n) is click.core.ParameterSource.COMMANDLINE}
-    textured = {"--motion": motion, "--seeds": seeds, "--least": least, **dict.fromkeys(stated, True)}
-    for name, value in textured.items():
-        if value is not None and bright is not None:
-            raise ObservationError(f"{name} needs texture, --bright has none", remedy="Leave out one of them.")
+    _screen.check_folder(wanted.out)
+    videos_alone = ("motion", "bounds", "bright", "reach", "neighbours")
+    of_videos = [f"--{name}" for name in videos_alone if _screen.is_stated(name)]
+    for name in ("motion", "seeds", "least", "window", "step"):
+        if _screen.is_stated(name) and wanted.bright is not None:
+            raise ObservationError(f"--{name} needs texture, --bright has none", remedy="Leave out one of them.")
     one_video = flat is not None and not views and calibration.suffix.lower() not in _measure.PHOTOGRAPHS
-    if one_video and (motion or seeds) is not None:
+    if one_video and (wanted.motion or wanted.seeds) is not None:
         raise ObservationError("--motion and --seeds need a calibration", remedy="Leave them out, or leave out --flat.")
     if of_videos and flat is not None and not one_video:
         raise ObservationError(f"{of_videos[0]} needs videos; --flat has photographs", remedy="Leave out one of them.")
@@ -97,7 +94,7 @@ def surface(
         if one_video:
             rig, paths = _measure.flat_video(calibration, flat or 0.0)
         else:
-            rig, paths = _measure.read_views(calibration, unit, views, 1 if motion is not None else 2)
+            rig, paths = _measure.read_views(calibration, unit, views, 1 if wanted.motion is not None else 2)
         if of_videos and not paths.videos:
             problem = f"{of_videos[0]} needs videos; the views are photographs"
             raise ObservationError(problem, remedy="Leave it out, or give videos.")
@@ -106,4 +103,4 @@ def surface(
             lines = measure(rig, paths, wanted, progress)
     for line in lines:
         _screen.say(line)
-    _screen.say(f"\nWritten: {out}")
+    _screen.say(f"\nWritten: {wanted.out}")

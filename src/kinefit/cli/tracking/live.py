@@ -38,7 +38,7 @@ Examples:
 @click.option("-o", "--out", type=_screen.PATH, help="Folder of the session.  [default: TAKE-live]")
 @click.option("--page/--no-page", default=True, show_default=True, help="Serve a web page, and poses by WebSocket.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="0: any free port.")
-@click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 admits other computers.")
+@_screen.host_option
 @_screen.token_option
 @click.option("--vmc", callback=_address, metavar="HOST:PORT", help="Send poses to an avatar by VMC over OSC.")
 @click.option("--lsl", metavar="NAME", help="Send angles and joints to the Lab Streaming Layer (extra `lsl`).")

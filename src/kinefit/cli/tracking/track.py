@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,11 +31,34 @@ def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -
 PICTURES = ("full", "blurred", "none")
 
 
-def choices_options(command: Callable) -> Callable:
-    """Add the options that say what is made of a take, given to the command as `Choices`, `choices`.
+def _choices(**chosen: Any) -> Choices:
+    """What is made of a take; refuses choices that exclude each other."""
+    from kinefit.takes.batch.one import Choices
 
-    The command gets `wanted`, too: whether overlays were asked for in so many words.
-    """
+    if chosen["pictures"] == "blurred":
+        _screen.note("--pictures blurred is outdated: use --hide-faces, which blurs all detected faces.")
+        chosen |= {"pictures": "full", "hide_faces": True}
+    chosen["smooth"] = not chosen.pop("realtime")
+    choices = Choices(**chosen)
+    if choices.contacts and not choices.smooth:
+        raise click.UsageError("--contacts needs the whole take, which --realtime does not use: give one of them.")
+    if choices.lag is not None and (choices.contacts or not choices.smooth):
+        other = "--contacts needs the whole take" if choices.contacts else "--realtime uses no later frames"
+        raise click.UsageError(f"{other}, --lag SECONDS uses that many seconds of later frames: give one of them.")
+    if choices.overlay_skin and not choices.draws:
+        raise click.UsageError("--overlay-skin draws on overlays; --no-overlays and --pictures none write none.")
+    if choices.pictures == "none" and _needs_overlays(choices):
+        raise click.UsageError("--overlays shows the videos, --pictures none does not: give one of them.")
+    return choices
+
+
+def _needs_overlays(choices: Choices) -> bool:
+    """Whether overlays were asked for in so many words."""
+    return choices.overlay_skin or (choices.overlays and _screen.is_stated("overlays"))
+
+
+def choices_options(command: Callable) -> Callable:
+    """Add the options that say what is made of a take, given to the command as `Choices`, `choices`."""
     options = (
         click.option("--overlays/--no-overlays", default=True, show_default=True, help="Write videos with the fit."),
         click.option("--overlay-skin", is_flag=True, help="Draw the person's skin on the videos, too."),
@@ -68,44 +90,13 @@ def choices_options(command: Callable) -> Callable:
             "--restart", is_flag=True, help="Track all frames again.  [default: continue an interrupted run]"
         ),
     )  # fmt: skip
-
-    @wraps(command)
-    def called(*args: Any, **given: Any) -> Any:
-        from kinefit.takes.batch.one import Choices
-
-        chosen = {parameter: given.pop(parameter) for parameter in _CHOICES}
-        source = click.get_current_context().get_parameter_source("overlays")
-        wanted = (chosen["overlays"] and source == click.core.ParameterSource.COMMANDLINE) or chosen["overlay_skin"]
-        if chosen["pictures"] == "blurred":
-            _screen.note("--pictures blurred is outdated: use --hide-faces, which blurs all detected faces.")
-            chosen |= {"pictures": "full", "hide_faces": True}
-        chosen["smooth"] = not chosen.pop("realtime")
-        choices = Choices(**chosen)
-        _check(choices, wanted)
-        return command(*args, **given, choices=choices, wanted=wanted)
-
+    command = _screen.gathered(
+        "choices", _choices, "overlays", "overlay_skin", "formats", "report", "pictures", "contacts", "realtime", "lag",
+        "person", "restart", "hide_faces",
+    )(command)
     for option in reversed(options):
-        called = option(called)
-    return called
-
-
-_CHOICES = (
-    "overlays", "overlay_skin", "formats", "report", "pictures", "contacts", "realtime", "lag", "person", "restart",
-    "hide_faces",
-)  # fmt: skip
-
-
-def _check(choices: Choices, wanted: bool) -> None:
-    """Refuse choices that exclude each other."""
-    if choices.contacts and not choices.smooth:
-        raise click.UsageError("--contacts needs the whole take, which --realtime does not use: give one of them.")
-    if choices.lag is not None and (choices.contacts or not choices.smooth):
-        other = "--contacts needs the whole take" if choices.contacts else "--realtime uses no later frames"
-        raise click.UsageError(f"{other}, --lag SECONDS uses that many seconds of later frames: give one of them.")
-    if choices.overlay_skin and not choices.draws:
-        raise click.UsageError("--overlay-skin draws on overlays; --no-overlays and --pictures none write none.")
-    if choices.pictures == "none" and wanted:
-        raise click.UsageError("--overlays shows the videos, --pictures none does not: give one of them.")
+        command = option(command)
+    return command
 
 
 @click.command(short_help="Track the person of a take file and write all results.", epilog="""\b
@@ -125,8 +116,8 @@ Examples:
 @_screen.verbose_option
 @click.pass_context
 def track(
-    ctx: click.Context, take: Path, out: Path | None, choices: Choices, wanted: bool, as_json: bool
-) -> None:
+    ctx: click.Context, take: Path, out: Path | None, choices: Choices, as_json: bool
+) -> None:  # fmt: skip
     """Track the people of a take file and write all results.
 
     TAKE is a take file: a TOML file that names calibration, cameras, videos and keypoints (docs/take-file.md). It may
@@ -148,7 +139,7 @@ def track(
     take = write_first_take(take) if take.is_dir() and not takes_in(take) else find_take(take)
     out = out or take.with_name(f"{take.stem}-kinefit")
     people: list[dict[str, Any]] = []
-    code = run(take, out, choices, wanted=wanted, results=people)
+    code = run(take, out, choices, wanted=_needs_overlays(choices), results=people)
     if as_json:
         _screen.print_json({"take": str(take), "folder": str(out), "exit_code": code, "people": people})
     ctx.exit(code)
@@ -337,7 +328,7 @@ Exit codes: 0 where all takes are done, 2 where some have failed (the others are
 @click.pass_context
 def batch(
     ctx: click.Context, patterns: tuple[str, ...], out: Path, workers: int | None, cluster: str | None, retries: int,
-    time_limit: float, choices: Choices, wanted: bool,
+    time_limit: float, choices: Choices,
 ) -> None:
     """Track every take that PATTERN matches, like `kinefit track`, and write summary.html over all of them.
 

@@ -60,7 +60,8 @@ def force_plots(motions: Iterable[Motion]) -> list[p.Html]:
         lines, sides = [], set[str]()
         for step in steps:
             lines.append(p.line(
-                PERCENT, getattr(step, what), step.side, _COLOURS[step.side], 1.5, legend=step.side not in sides
+                PERCENT, getattr(step, what), step.side, p.Stroke(_COLOURS[step.side], 1.5),
+                legend=step.side not in sides,
             ))  # fmt: skip
             sides.add(step.side)
         axes = {"xaxis": {"title": {"text": "stance [%]"}}, "yaxis": {"title": {"text": "body weights"}}}

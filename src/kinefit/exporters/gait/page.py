@@ -31,7 +31,7 @@ _DEFINITIONS = (
     "the other heel's distance from the stride.",
     "Foot progression is positive with the toes out.",
     "A walk is straight where the pelvis turns by less than 20° from contact to contact.",
-    "Left minus right stands beside its share of the mean of both sides, which is zero of a symmetric walk.",
+    "Left minus right is followed by its share of the mean of both sides, which is zero of a symmetric walk.",
     "± is two standard deviations of the mean's error. SD is the standard deviation of single strides and steps.",
 )  # fmt: skip
 

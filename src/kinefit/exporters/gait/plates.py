@@ -38,10 +38,10 @@ _WHOLE_SHARE = 0.9  # of the time, and of a foot's points, over a plate
 _NEARER = 0.05  # [m] by which the other foot is farther away, so that it is known whose step it is
 _EDGE = 0.03  # [m] beyond a plate's edge: the skin and errors of landmarks
 _MOVING, _STANDING_SHARE = 0.5, 0.2  # [m/s] of a foot that swings past the other; of the time, in which it stands
-_LOW = 0.15  # [m] above a plate: markers of a foot that stands on it
-_PARTLY = "a foot stands partly beside it"
+_STANDING_M = 0.15  # above a plate, at most: markers of a foot that stands on it
+_PARTLY = "a foot stands partly off it"
 _MIN_OFFSET, _MAX_CORRECTED = 0.06, 0.04  # [m] from the foot in the median: surely wrong; right once it is corrected
-_FOOT_OFFSET = 0.3  # [m]: about a foot's length beside it, somebody or something else stands there
+_FOOT_OFFSET = 0.3  # [m]: about a foot's length away from it, somebody or something else stands there
 _CORRECTED_SHARE = 0.4  # of the distance before, once it is corrected
 _SAME_S = 0.12  # [s] between an event of a plate and that of the motion which is the same
 _STRIDE_S = 0.4  # [s] from an event to the next one of its kind and foot, at least: sprinters take 0.45 s
@@ -271,7 +271,7 @@ def by_plates(steps: Sequence[Footfall], side: str, end: str, times: NDArray, st
 
 
 def _lateness(loaded: Sequence[_Loaded], events: Events) -> _Late | None:
-    """[s] of the plates' clock beside the motion's, its deviation and the number of events; None if it is right."""
+    """[s] by which the plates' clock is late, its deviation and the number of events; None if it is right."""
     late = np.array([off for one in loaded for off in _late_events(one, events)])
     spread = 1.48 * float(np.median(np.abs(late - np.median(late)))) if len(late) else np.inf
     if len(late) < 2 or abs(np.median(late)) < _LATE_S or spread > _MAX_SPREAD_S:
@@ -293,7 +293,7 @@ def _plate_findings(motion: Motion, loaded: Sequence[_Loaded], late: _Late | Non
             out += [_finding(text, confidence, "CORNERS, or shift and turn of its [[plate]]")] * bool(text)
     if late is not None:
         apart = f"{late[0]:+.3f} ± {late[1]:.3f} s"
-        text = f"The plates' clock is {apart} beside that of the motion: no event is taken of them."
+        text = f"The plates' clock is {apart} off that of the motion: no event is taken of them."
         out.append(_finding(text, f"Likely, by {late[2]} contacts and toe-offs.", "time_offset of its [[plate]]"))
     return out
 
@@ -318,7 +318,7 @@ def stood_on(motion: Motion, others: Sequence[Markers]) -> tuple[tuple[ForcePlat
     loaded = [one for one in _loaded(motion, np.zeros(3)) if one.is_stood_on(0) or one.is_stood_on(1)]
     shared = dict.fromkeys(one.plate.name for one in loaded if any(_is_shared(one, other) for other in others))
     own = {one.plate.name for one in loaded} - shared.keys()
-    text = "The force on {} is given to nobody: another person stands there at the same time."
+    text = "The force on {} is assigned to no person: another person stands there at the same time."
     notes = [Finding("note", "plates", text.format(name)) for name in shared]
     return tuple(plate for plate in motion.plates if plate.name in own), notes
 
@@ -327,13 +327,13 @@ def _is_shared(one: _Loaded, other: Markers) -> bool:
     """Whether markers of another person stay low over a plate for a fifth of the time that it is loaded."""
     x = other.positions - one.plate.centre
     slow = np.linalg.norm(np.gradient(x, 1.0 / other.rate, axis=0), axis=-1) < _MOVING
-    low = slow & np.all(np.abs(x @ one.plate.axes.T) < one.half, axis=-1) & (np.abs(x @ one.plate.normal) < _LOW)
+    low = slow & np.all(np.abs(x @ one.plate.axes.T) < one.half, axis=-1) & (np.abs(x @ one.plate.normal) < _STANDING_M)
     during = (other.times >= one.span[0]) & (other.times <= one.span[1])
     return bool(during.any() and low[during].any(axis=1).mean() > _STANDING_SHARE)
 
 
 def _misplaced(own: list[_Loaded]) -> tuple[str, str]:
-    """How a plate lies beside where it is said to lie, and how sure that is; empty where it does not."""
+    """How a plate differs from its stated place, and how certain that is; empty where it does not."""
     turns = {"turned by 180 degrees": (-1, -1), "mirrored along x": (-1, 1), "mirrored along y": (1, -1)}
     nearest = lambda one, cop: min(np.moveaxis(one.offsets_of(cop), 1, 0), key=lambda e: np.median(np.hypot(*e.T)))
     distance = lambda offsets: float(np.median(np.hypot(*np.concatenate(offsets).T)))

@@ -30,7 +30,7 @@ Values = Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """One motion of a person who walks, without its ends in which nobody was seen.
+    """One motion of a person who walks, without its ends in which no person was observed.
 
     Parameters
     ----------
@@ -170,9 +170,9 @@ def _walk(name: str, motion: Motion) -> Walk | str:
     seen = np.flatnonzero(motion.quality > 0.0)
     notes = []
     if len(seen) and seen[-1] - seen[0] + 1 < len(motion):
-        notes.append(f"frames before {seen[0]} and after {seen[-1]} are left out: nobody was seen.")
+        notes.append(f"frames before {seen[0]} and after {seen[-1]} are left out: no person was observed.")
         motion = motion.part(slice(int(seen[0]), int(seen[-1]) + 1))
-    fault = "nobody was seen" if not len(seen) else _posture_fault(motion)
+    fault = "no person was observed" if not len(seen) else _posture_fault(motion)
     feet = None if fault else foot_events(motion)
     if feet is None:
         return fault or "the body has no balls of the feet"

@@ -40,7 +40,7 @@ class Drop:
 
     Parameters
     ----------
-    begin : last frame of standing; -1 where nobody stood before
+    begin : last frame of standing; -1 if the person did not stand before
     down, low, up : first frame at the bottom, the lowest, and the last one at the bottom
     end : first frame of standing again
     """

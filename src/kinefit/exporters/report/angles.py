@@ -97,7 +97,7 @@ def cycle_plots(trials: Sequence[tuple[Motion, Cycles]], norms: Norms | None = N
             shown[stem] = usable
         if shown:
             of = {c.side or other for usable in shown.values() for c in usable}
-            lines = [p.mark("x", at, _COLOURS[side], 1.2, "dash") for side, at in marks.items() if side in of]
+            lines = [p.mark("x", at, p.Stroke(_COLOURS[side], 1.2, "dash")) for side, at in marks.items() if side in of]
             out[joint] = _stacked(traces, list(shown.values()), [None] * len(shown), "cycle [%]", marks=lines)
     return out
 
@@ -120,7 +120,7 @@ def _over_time(curve: Curve, times: NDArray, row: int, legend: bool) -> list[dic
     out = p.band(t, values, np.where(known, 2 * std, np.nan), name, colour, row)
     if known.any():
         out.append(p.line(
-            t, np.where(known, values, np.nan), name, colour, 1.8, row=row, legend=legend and row == 0,
+            t, np.where(known, values, np.nan), name, p.Stroke(colour, 1.8), row=row, legend=legend and row == 0,
             hover=f"{name} %{{y:.4~g}} ± %{{customdata:.2~g}} {curve.unit}", customdata=np.where(known, 2 * std, 0),
         ))  # fmt: skip
     if not known.all():
@@ -128,7 +128,7 @@ def _over_time(curve: Curve, times: NDArray, row: int, legend: bool) -> list[dic
         near[:-1] |= ~known[1:]
         near[1:] |= ~known[:-1]
         out.append(p.line(
-            t, np.where(near, values, np.nan), name, _GREY, 1.4, dash="dash" if curve.side == "right" else "dot",
+            t, np.where(near, values, np.nan), name, p.Stroke(_GREY, 1.4, "dash" if curve.side == "right" else "dot"),
             row=row, hover=f"{name} %{{y:.4~g}} {curve.unit}, not observed",
         ))  # fmt: skip
     return out
@@ -138,17 +138,17 @@ def _over_cycle(curve: Curve, values: NDArray, row: int, of: str) -> list[dict]:
     name, colour, mean = curve.side or "middle", _COLOURS[curve.side], values.mean(axis=0)
     out = p.band(PERCENT, mean, values.std(axis=0, ddof=1), name, colour, row) if len(values) >= 3 else []
     if len(values) <= 8:
-        out += [p.line(PERCENT, cycle, name, colour, 0.8, row=row, opacity=0.45) for cycle in values]
+        out += [p.line(PERCENT, cycle, name, p.Stroke(colour, 0.8), row=row, opacity=0.45) for cycle in values]
     unseen = not np.isfinite(curve.std).mean() > 0.5
     label = f"{name}, {len(values)} {'' if of.strip() == curve.side else of}cycles"
     return [*out, p.line(
-        PERCENT, mean, label, _GREY if unseen else colour, 2.2, dash="dot" if unseen else "", row=row, legend=row == 0,
-        hover=f"{name} %{{y:.4~g}} {curve.unit}", legendgroup=name,
+        PERCENT, mean, label, p.Stroke(_GREY, 2.2, "dot") if unseen else p.Stroke(colour, 2.2), row=row,
+        legend=row == 0, hover=f"{name} %{{y:.4~g}} {curve.unit}", legendgroup=name,
     )]  # fmt: skip
 
 
 def _range(sides: list[Curve]) -> list[float]:
-    """Of the vertical axis: all values with their usual bands, but a band may not squeeze the curve to a line."""
+    """Of the vertical axis: all values with their error bands, but a band may not squeeze the curve to a line."""
     low, high = min(c.values.min() for c in sides), max(c.values.max() for c in sides)
     least = 10.0 if sides[0].unit == "deg" else 0.05
     stds = np.concatenate([c.std for c in sides])

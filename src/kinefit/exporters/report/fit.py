@@ -104,7 +104,7 @@ def quality_plot(motion: Motion, moments: Sequence[Moment]) -> p.Html:
     """Quality and every sensor's residual over time, doubtful moments shaded; a click moves the 3D figure."""
     times, at, half = motion.times, p.thinned(motion.quality), 0.5 / motion.rate
     hover = "quality %{y:.2f}"
-    traces = [p.line(times[at], motion.quality[at], "quality", "#4d4d4d", 1.8, hover=hover)]
+    traces = [p.line(times[at], motion.quality[at], "quality", p.Stroke("#4d4d4d", 1.8), hover=hover)]
     units = list(dict.fromkeys(r.unit for r in motion.residuals.values()))
     for k, (name, r) in enumerate(motion.residuals.items()):
         factor, unit = SHOWN_UNITS[r.unit]
@@ -113,9 +113,8 @@ def quality_plot(motion: Motion, moments: Sequence[Moment]) -> p.Html:
         whole = len(level) <= p.MAX_CURVE_POINTS or not len(known)
         at = np.arange(len(level)) if whole else known[p.thinned(level[known])]
         hover, row = f"{name} %{{y:.1f}} {unit}", 1 + units.index(r.unit)
-        traces.append(
-            p.line(times[at], level[at], name, p.SERIES[k % len(p.SERIES)], 1.4, hover=hover, row=row, legend=True)
-        )
+        colour = p.SERIES[k % len(p.SERIES)]
+        traces.append(p.line(times[at], level[at], name, p.Stroke(colour, 1.4), hover=hover, row=row, legend=True))
     axes: list[dict[str, Any]] = [{"title": "quality", "range": [0, 1.03]}]
     axes += [{"title": f"residual [{SHOWN_UNITS[unit][1]}]", "rangemode": "tozero"} for unit in units]
     marks: list[dict[str, Any]] = [
@@ -123,7 +122,7 @@ def quality_plot(motion: Motion, moments: Sequence[Moment]) -> p.Html:
          "x1": times[m.stop - 1] + half, "fillcolor": "rgba(224,161,0,0.25)", "line": {"width": 0}, "layer": "below"}
         for m in moments[:100]
     ]  # fmt: skip
-    marks.append(p.mark("y", POORLY_SUPPORTED, "#a87600", 1, "dot"))
+    marks.append(p.mark("y", POORLY_SUPPORTED, p.Stroke("#a87600", 1, "dot")))
     return p.stacked(traces, axes, "time [s]", "quality and residuals over time", marks=marks, seeks=True)
 
 

@@ -66,7 +66,7 @@ def time_line(motion: Motion, moments: Sequence[doubt.Moment]) -> p.Html:
                     half = 0.5 / motion.rate
                     x += [motion.times[m.start] - half, motion.times[m.stop - 1] + half, np.nan]
             if x:
-                traces.append(p.line(x, [name] * len(x), name, colour, 12, hover=f"{name} %{{x:.2f}} s"))
+                traces.append(p.line(x, [name] * len(x), name, p.Stroke(colour, 12), hover=f"{name} %{{x:.2f}} s"))
     layout = {
         "margin": {"l": 10, "r": 12, "t": 30, "b": 40}, "yaxis": {"type": "category", "automargin": True},
         "xaxis": {"title": "time [s]", "range": [float(motion.times[0]), float(motion.times[-1])]},

@@ -15,9 +15,9 @@ from kinefit.bodies.motion import Motion, Residuals
 from kinefit.exporters.tables import DIGITS, split_side
 from kinefit.findings import listed, runs_of
 
-DOUBT_DISTANCE_M = 0.05  # [m] from the truth: about half as thick as a limb, which then lies beside itself
+DOUBT_DISTANCE_M = 0.05  # [m] from the truth: about half as thick as a limb, which then is drawn outside itself
 _DOUBTFUL = 0.5  # probability that an end is farther off, above which a segment is doubtful
-_MAX_CONTRADICTION_M = 0.08  # [m] of points beside the fit; of 91 segments beyond it in simulated takes 11 were wrong
+_MAX_CONTRADICTION_M = 0.08  # [m] of points away from the fit; of 91 segments beyond it in simulations 11 were wrong
 _MIN_VARIANCE_M2 = 1e-12  # of an end that is exact
 _FLAT_ROOT_SIGMA = 1.0  # [m, rad] of a root that nothing holds
 _MAX_STD = 1e3  # [rad, m] of a coordinate without a prior
@@ -95,7 +95,7 @@ def end_variances(motion: Motion) -> NDArray:
 
 
 def contradicted(motion: Motion) -> NDArray:
-    """(F, S) bool: segments whose points most views, for a tenth of a second, show more than 8 cm beside the fit."""
+    """(F, S) bool: segments whose points most views, for a tenth of a second, show more than 8 cm away from the fit."""
     shape = motion.segment_quality.shape
     seen, off = np.zeros(shape), np.zeros(shape)
     for r in motion.residuals.values():
@@ -167,7 +167,7 @@ class Moment:
 class _Doubt:
     """One doubt: of one kind, about one segment ("" for the whole body)."""
 
-    kind: str  # "nobody", "against" or "wide"
+    kind: str  # "unobserved", "against" or "wide"
     start: int
     stop: int
     worst: int
@@ -275,7 +275,7 @@ def _runs(motion: Motion, flags: NDArray) -> list[tuple[int, int]]:
 
 def _nobody(motion: Motion) -> Iterable[_Doubt]:
     for start, stop in runs_of(motion.quality <= 0):
-        yield _Doubt("nobody", start, stop, (start + stop) // 2, stop - start)
+        yield _Doubt("unobserved", start, stop, (start + stop) // 2, stop - start)
 
 
 def _doubts(motion: Motion) -> Iterable[_Doubt]:
@@ -329,7 +329,7 @@ def _sentences(body: Body, group: Sequence[_Doubt]) -> Iterable[str]:
         same = [g for g in group if g.kind == kind]
         names = spoken_segments(body, [g.segment for g in same])
         most = max(g.amount for g in same)
-        if kind == "nobody":
+        if kind == "unobserved":
             yield "The person was not observed; the body keeps its last pose."
         elif kind == "against":
             yield f"Most views show {names} more than 8 cm away from the body."

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote as urlquote
 
 import cv2
@@ -221,7 +221,7 @@ def quote(text: str) -> Html:
 
 
 def file_link(path: str, text: str | None = None) -> Html:
-    """Link to a file that lies beside the page, by its relative path."""
+    """Link to a file that lies next to the page, by its relative path."""
     return Html(f'<a href="{escape(urlquote(path))}">{inline(path if text is None else text)}</a>')
 
 
@@ -367,14 +367,22 @@ def fault_sections(faults: Iterable[Finding]) -> list[Section]:
     return [section("Faults of the inputs", paragraph(text), *boxes)]
 
 
+class Stroke(NamedTuple):
+    """How a line is drawn: its colour, its width [px], its dashes ("" for none)."""
+
+    color: str
+    width: float
+    dash: str = ""
+
+
 def line(
-    x: ArrayLike, y: ArrayLike, name: str, colour: str, width: float, *, hover: str = "", dash: str = "", row: int = 0,
-    legend: bool = False, **more: Any,
+    x: ArrayLike, y: ArrayLike, name: str, stroke: Stroke, *, hover: str = "", row: int = 0, legend: bool = False,
+    **more: Any,
 ) -> dict[str, Any]:  # fmt: skip
     """A line in a row, of single points where it has no more than two; without `hover` it says nothing of itself."""
     return {
         "x": x, "y": y, "mode": "lines" if np.size(x) > 2 else "markers", "name": name, "legendgroup": name,
-        "line": {"color": colour, "width": width, **({"dash": dash} if dash else {})}, "showlegend": legend,
+        "line": {name: value for name, value in stroke._asdict().items() if value}, "showlegend": legend,
         **({"hovertemplate": f"{hover}<extra></extra>"} if hover else {"hoverinfo": "skip"}), **_axes(row), **more,
     }  # fmt: skip
 
@@ -396,11 +404,11 @@ def band(x: NDArray, middle: NDArray, half: NDArray, name: str, colour: str, row
     return [trace] if len(known) else []
 
 
-def mark(along: str, at: float, colour: str, width: float, dash: str) -> dict[str, Any]:
+def mark(along: str, at: float, stroke: Stroke) -> dict[str, Any]:
     """A straight line across a plot at a place on its axis "x" (of all rows) or "y"."""
     other = "y" if along == "x" else "x"
     place = {f"{along}ref": along, f"{along}0": at, f"{along}1": at, f"{other}ref": "paper", f"{other}0": 0}
-    return {"type": "line", **place, f"{other}1": 1, "line": {"color": colour, "width": width, "dash": dash}}
+    return {"type": "line", **place, f"{other}1": 1, "line": stroke._asdict()}
 
 
 def stacked(

@@ -113,7 +113,8 @@ def write_report(
     if files:
         rows = [(p.file_link(name), about) for name, about in files.items()]
         sections.append(p.section("Files", p.table(["file", "what it is"], rows, first_left=2)))
-    write_text(path, p.page(motion.name, sections, subtitle=_subtitle(motion, date)))
+    subtitle = f"Motion report, {date}. {len(motion)} frames at {motion.rate:g} Hz, {len(motion) / motion.rate:.2f} s."
+    write_text(path, p.page(motion.name, sections, subtitle=subtitle))
     return Path(path)
 
 
@@ -128,10 +129,6 @@ def trust_sentence(motion: Motion, moments: Sequence[doubt.Moment]) -> str:
     if not moments:
         return f"The motion {start}; no doubtful moment."
     return f"The motion {start}; doubtful moments: {doubt.doubt_sentence(motion, moments)}."
-
-
-def _subtitle(motion: Motion, date: str) -> str:
-    return f"Motion report, {date}. {len(motion)} frames at {motion.rate:g} Hz, {len(motion) / motion.rate:.2f} s."
 
 
 def _summary(

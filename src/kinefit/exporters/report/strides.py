@@ -22,7 +22,7 @@ QUANTITIES = (
 
 _LEAST_SHARE = 0.3  # of the stature, of a stride that goes anywhere: shorter ones have no direction
 
-_SETTLED = 0.1  # of a stride after contact: the heel slides no more, and does not rise yet
+_SETTLING_SHARE = 0.1  # of a stride after contact: the heel slides no more, and does not rise yet
 
 Term = tuple[str, int, float]  # landmark, frame, weight
 
@@ -112,7 +112,7 @@ def step_quantities(motion: Motion, feet: Feet, side: str, start: float, stop: f
     own, other = (feet.left, feet.right) if side == "left" else (feet.right, feet.left)
     std = float(np.hypot(_std_at(other, start), _std_at(own, stop)))
     out = {"step time [s]": (stop - start, std)}
-    ground, settled = _Ground(motion, feet.belt), _SETTLED * 2.0 * (stop - start)
+    ground, settled = _Ground(motion, feet.belt), _SETTLING_SHARE * 2.0 * (stop - start)
     begin, end = (ground.frame(t + settled) for t in (start, stop))
     way = ground.sum_of([(f"{s}_hip", at, sign * 0.5) for s in "lr" for at, sign in ((end, 1.0), (begin, -1.0))])
     if float(np.linalg.norm(way)) > 0.5 * _LEAST_SHARE * (motion.body.stature or 1.7):
@@ -137,7 +137,7 @@ def _lengths(
     motion: Motion, feet: Feet, side: str, start: float, stop: float, landed: float | None, off: float | None
 ) -> dict[str, tuple[float, float]]:
     """Of a stride of foot "l" or "r", in which the other one lands and this one leaves the ground at times [s]."""
-    ground, settled = _Ground(motion, feet.belt), _SETTLED * (stop - start)
+    ground, settled = _Ground(motion, feet.belt), _SETTLING_SHARE * (stop - start)
     begin, end = (ground.frame(t + settled) for t in (start, stop))
     heel, opposite = ground.heel(side), ground.heel("r" if side == "l" else "l")
     stride: list[Term] = [(heel, end, 1.0), (heel, begin, -1.0)]

@@ -41,7 +41,7 @@ def write_bvh(
     up : str
         Vertical axis of the file's world.
     names : "bvh", "kinefit", "mixamo", "cmu", "opensim", "hanim", "vrm", "unity" or "unreal"
-        Names of the joints; "bvh": the usual ones (Hips, RightUpLeg ...).
+        Names of the joints; "bvh": common ones (Hips, RightUpLeg ...).
     rest : "body" or "t", optional
         Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with the
         names of Mixamo, VRM, Unity and Unreal.

@@ -157,10 +157,6 @@ def _table(*rows: Sequence[Any]) -> Record:
     return record("Properties70", inside=[record("P", *row) for row in rows])
 
 
-def _integer(name: str, value: int) -> tuple[Any, ...]:
-    return name, "int", "Integer", "", value
-
-
 def _time(name: str, value: np.int64) -> tuple[Any, ...]:
     return name, "KTime", "Time", "", value
 
@@ -195,7 +191,7 @@ def _settings(rate: float, ticks: NDArray, up: str, factor: float) -> Record:
     axes = zip(("UpAxis", "UpAxisSign", "FrontAxis", "FrontAxisSign", "CoordAxis", "CoordAxisSign"), (*_UPS[up], 0, 1))
     mode = _TIME_MODES.get(round(rate), _TIME_MODE_CUSTOM) if rate == round(rate) else _TIME_MODE_CUSTOM
     return record("GlobalSettings", inside=[record("Version", 1000), _table(
-        *(_integer(name, value) for name, value in axes),
+        *((name, "int", "Integer", "", value) for name, value in axes),
         ("UnitScaleFactor", "double", "Number", "", common.UNITS["cm"] / factor), ("TimeMode", "enum", "", "", mode),
         _time("TimeSpanStart", ticks[0]), _time("TimeSpanStop", ticks[-1]),
         ("CustomFrameRate", "double", "Number", "", float(rate)),

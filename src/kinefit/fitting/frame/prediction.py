@@ -99,7 +99,7 @@ class Prediction:
         assert self.state is not None
         self._ahead = self.state
         whole = int(steps + 1e-6)
-        for h in [1.0] * whole + [steps - whole] * (steps - whole > 1e-6):
+        for h in [1.0] * whole + [steps - whole] * bool(steps - whole > 1e-6):
             keep = np.ones(len(self._keep)) if self._halted else self._keep**h
             self._velocity = keep * self._velocity
             vx, vv = keep[:, None] * self._vx, keep[:, None] * self._vv * keep

@@ -258,15 +258,14 @@ def _blobs(depth: NDArray, camera: Camera, up: NDArray, mask: NDArray | None) ->
     known: list[DepthBlob] = []
     for gap in _JOINING_GAPS:
         blobs = people(depth, camera, mask=mask, floor=floor, gap=gap)
-        new = [blob for blob in blobs if not any(_is_same_blob(blob, k) for k in known)]
+        new = [
+            blob for blob in blobs
+            if not any(np.sum(blob.mask & k.mask) > _MIN_SAME_OVERLAP * np.sum(blob.mask | k.mask) for k in known)
+        ]  # fmt: skip
         new.sort(key=lambda b: _is_flat(to_points(depth, camera, mask=b.mask)))
         known += new
         if new:
             yield new[:_MAX_BLOBS]
-
-
-def _is_same_blob(a: DepthBlob, b: DepthBlob) -> bool:
-    return bool(np.sum(a.mask & b.mask) > _MIN_SAME_OVERLAP * np.sum(a.mask | b.mask))
 
 
 def _is_flat(x: NDArray) -> bool:

@@ -5,7 +5,7 @@ An initial pose from joints annotated manually in images of one time: points, bo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -186,6 +186,13 @@ def clickable(body: Body) -> tuple[str, ...]:
     return tuple(n for n, c in zip(points.names, is_centre) if c or n.split("_", 1)[-1] in _ENDS or n in _ENDS)
 
 
+def check_landmarks(body: Body, names: Iterable[str]) -> None:
+    """Raise TrackingError for a name of no landmark of the body."""
+    unknown = [name for name in names if name not in body.landmarks.names]
+    if unknown:
+        raise TrackingError(choices(f"landmark of body '{body.name}'", unknown[0], clickable(body)))
+
+
 def clicked_points(rig: Rig, names: Sequence[str], uv: NDArray) -> tuple[NDArray, NDArray]:
     """Triangulate manual annotations, check that they agree, and estimate their covariance.
 
@@ -286,9 +293,7 @@ def clicked_start(
     TrackingError
         The body lacks a landmark, no bone lies between two points, or the size is impossible.
     """
-    unknown = [name for name in names if name not in body.landmarks.names]
-    if unknown:
-        raise TrackingError(choices(f"landmark of body '{body.name}'", unknown[0], clickable(body)))
+    check_landmarks(body, names)
     points = body.landmarks.select(tuple(names))
     fitted = body.scaled(first_scales(body, points, x_world[None], covariance=covariance))
     points = fitted.landmarks.select(tuple(names))

@@ -135,7 +135,7 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
     In every frame, detections of different records are grouped if their keypoints intersect in space. Dynamic
     programming finds the path through the groups with the largest sum of keypoint confidences over the take and few
     switches. Of several detectors' records of a camera, the most confident one is used (a face mesh last). The others
-    follow by bounding boxes, or by themselves where the first sees nobody and both agree elsewhere.
+    follow by bounding boxes, or by themselves where the first sees no person and both agree elsewhere.
 
     Parameters
     ----------

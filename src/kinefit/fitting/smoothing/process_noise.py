@@ -43,7 +43,7 @@ class SmoothTake:
     deviation; `observed` (T, D) bool: coordinates that a frame nearby observes on its own; `live` (T, n): activity,
     a factor on the process noise;
     `speed_std` (n,) [m/s, rad/s]: 90th percentile over frames; `one_view`: one camera is the only sensor, so no other
-    view contradicts the errors of its keypoints.
+    view contradicts the errors of its keypoints; `looked`: share 0..1 of the frames in which a sensor looked.
     """
 
     body: Body
@@ -61,6 +61,7 @@ class SmoothTake:
     linear: Linearised | None = None
     speed_std: NDArray | None = None
     one_view: bool = False
+    looked: float = 1.0
 
     @property
     def blocks(self) -> tuple[PackedPoints, ...]:
@@ -122,9 +123,10 @@ class SmoothTake:
         lower, upper, mean = boxes(self.body.tree, self.angles)
         unobserved = ~self.observed.any(axis=0)  # stays at the prior mean
         lower[:, unobserved] = upper[:, unobserved] = mean[:, unobserved]
-        tree = self.body.tree
+        tree, root = self.body.tree, self.looked**0.5  # the posture counts as often as it is measured
         prior = MotionPrior(
-            self.acceleration, self.memory, self.dt, mean, tree.spread / posture**0.5, self.live, tree.couplings
+            self.acceleration, self.memory, self.dt, mean, tree.spread / (root * posture**0.5), self.live,
+            root * tree.couplings,
         )  # fmt: skip
         make = self.solver_points().equations(self.body)
         dense = self.linear is not None
@@ -170,7 +172,7 @@ def estimate(takes: list[SmoothTake], rounds: int) -> tuple[list[SmoothTake], in
         before, pixels = takes[0].acceleration, takes[0].pixels
         level = np.bincount(limb, level) / np.maximum(np.bincount(limb, informed), 1e-12)  # goes to the accelerations
         acceleration = _accelerations(squares, informed, start / before, groups) * before
-        looks = min(first.dt / DETECTOR_CORRELATION_TIME, 1.0)
+        looks = min(first.dt / first.looked / DETECTOR_CORRELATION_TIME, 1.0)
         residuals, r2, variance = (np.concatenate(p) for p in zip(*errors, strict=True))
         sigma, shared = _noise(channels, r2, variance, looks), shared_by(channels, residuals, variance, looks)
         sigma = np.maximum(sigma, _MIN_SIGMA_RATIO * channels.sigma)

@@ -39,15 +39,17 @@ _Push = tuple[NDArray, NDArray, NDArray]
 
 
 class Pushes(NamedTuple):
-    """Gradients Jᵀ W e of the pose by systematic errors e of one standard deviation, in one frame.
+    """Gradients Jᵀ W e of the pose by systematic errors e of one standard deviation of some sensors, in one frame.
 
     Parameters
     ----------
+    information : (n, n) of these sensors
     constant, drift : (k, n) of errors that last for the whole take, and of those that drift
     rest : (n, n) Σ s sᵀ of the gradients s of errors that are others in every frame
     surplus : (n, n) Σ s sᵀ of what the fit assumes beyond white errors, see `LastingPushes`
     """
 
+    information: NDArray
     constant: NDArray
     drift: NDArray
     rest: NDArray
@@ -127,7 +129,7 @@ class OtherNoise:
         constant, drift, surplus = (
             np.concatenate([none, *(stds[part][:, None] * push for stds, push in pushes)]) for part in range(3)
         )
-        return Pushes(constant, drift, rest, gram(surplus, surplus))
+        return Pushes(self.pooled(f), constant, drift, rest, gram(surplus, surplus))
 
     @property
     def drift_times(self) -> list[float]:

@@ -178,6 +178,7 @@ def as_tracked(frames: TrackedFrames) -> SmoothTake:
     return SmoothTake(
         body, pixels, markers, roots, angles, all_observed, acceleration, np.ones((len(roots), n)),
         1.0 / frames.tracker.rate, (settings.acceleration_memory, settings.smooth_memory), others=others,
+        looked=1.0 if frames.looked is None else max(float(frames.looked.mean()), 1.0 / len(roots)),
     )  # fmt: skip
 
 

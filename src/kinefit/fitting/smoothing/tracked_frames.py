@@ -118,6 +118,7 @@ class TrackedFrames:
     points : (T,) int, number of rows of these blocks in every frame
     scale : {sensor: factor on its standard deviation} of all others, estimated from the take
     values : {sensor: {name: value}} of their own unknowns, besides those of the scenes
+    looked : (T,) bool, frames in which a sensor looked; None for all
     """
 
     results: Sequence[FrameResult]
@@ -128,6 +129,7 @@ class TrackedFrames:
     points: NDArray = field(default_factory=lambda: np.zeros(0, int), kw_only=True)
     scale: Mapping[str, float] = field(default_factory=dict, kw_only=True)
     values: Mapping[str, Mapping[str, float]] = field(default_factory=dict, kw_only=True)
+    looked: NDArray | None = field(default=None, kw_only=True)
 
     def part(self, frames: slice) -> Self:
         """Some of the frames."""

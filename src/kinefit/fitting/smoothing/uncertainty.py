@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +51,7 @@ MOTION_CORRELATION_TIME = 0.1
 
 _BY_MEASUREMENTS = 0.8  # of a smoothed fit's variance, by errors of measurements, the rest by accelerations. 0.78 to
 # 0.83 by the spectrum of a motion prior that averages 0.2 s, at 30 to 100 Hz, with accelerations of 0.05 to 0.3 s
-_LARGEST = 6e4  # [m, rad] of what is kept, which 16 bits hold: of what nothing observes
+_MAX_STORED = 6e4  # [m, rad] of what is kept, which 16 bits hold: of what nothing observes
 _DIRECTIONS = 120  # of lasting errors that are kept. The sigma of differences on the balancing trial is within 0.3 %
 # of that with all; with 60 within 6 %, with 20 within 43 %
 _NOISE_STRETCHES = 6  # of a long take, from which the detectors' noise is estimated: 12,000 frames are enough
@@ -122,11 +123,10 @@ def with_systematic_errors(
     priors = KeypointPriors.of(subject, channels, cameras)
 
     def errors_at(f: int) -> SystematicErrors:
-        near, of_others = weight[others.near(f)], (others.pooled(f), others.pushes(f))
-        assumed = 1.0 / np.maximum(near.max(axis=0), 1e-12)
+        near = weight[others.near(f)]
+        averaged = Averaged(2 * others.half + 1, 1.0 / np.maximum(near.max(axis=0), 1e-12)) if smoothed else None
         return systematic_errors(
-            priors, layout, results[f].state, near.mean(axis=0), assumed, noise, shared, *of_others,
-            averaged=2 * others.half + 1 if smoothed else 0,
+            priors, layout, results[f].state, near.mean(axis=0), noise, shared, others.pushes(f), averaged
         )  # fmt: skip
 
     few = {f: errors_at(f) for f in sampled.tolist()}
@@ -214,8 +214,8 @@ class _KeyFrames:
         k = int(np.searchsorted(self.errors.frames, frame))
         if k < len(self.errors.frames) and self.errors.frames[k] == frame:
             constant, drift = _with_shapes(errors, shapes, frame), errors.drift
-            self.errors.constant[k] = np.clip(product(constant, self.constant), -_LARGEST, _LARGEST)
-            self.errors.drift[k] = np.clip(product(drift, self.drift), -_LARGEST, _LARGEST)
+            self.errors.constant[k] = np.clip(product(constant, self.constant), -_MAX_STORED, _MAX_STORED)
+            self.errors.drift[k] = np.clip(product(drift, self.drift), -_MAX_STORED, _MAX_STORED)
             if (k + 1) % KEYS_AT_ONCE == 0:
                 release(self.errors.constant, self.errors.drift)
 
@@ -334,9 +334,16 @@ def pixel_columns(
     return rows, whitened / np.where(root > 0.0, root, 1.0), root * twice
 
 
+class Averaged(NamedTuple):
+    """Number of frames that a smoothed fit averages; variances (N,) [px²] of channels that it counts as white."""
+
+    frames: int
+    assumed: NDArray
+
+
 def systematic_errors(
-    priors: KeypointPriors, layout: Layout, state: BodyState, weight: NDArray, assumed: NDArray,
-    noise: VarianceComponents, shared: SharedErrors, other_information: NDArray, others: Pushes, *, averaged: int = 0,
+    priors: KeypointPriors, layout: Layout, state: BodyState, weight: NDArray, noise: VarianceComponents,
+    shared: SharedErrors, others: Pushes, averaged: Averaged | None = None,
 ) -> SystematicErrors:  # fmt: skip
     """Covariance of one frame's pose from bias, drift, shared biases of sensors and shape.
 
@@ -344,12 +351,10 @@ def systematic_errors(
     ----------
     priors : shape and cameras with their covariance
     weight : (N,) [1/px²] of every channel in the fit, robust factor included; 0 where undetected
-    assumed : (N,) [px²] variance of a channel's errors, all of which the fit counts as white
     noise : of the detectors
     shared : share of a channel's errors, of jitter and drift alike, that its group shares
-    other_information : (n, n) of all sensors but the keypoints
-    others : of these
-    averaged : int, frames that the fit averages; 0 for a fit of each frame, whose variance is left as it is
+    others : of all sensors but the keypoints
+    averaged : None for a fit of each frame, whose variance is left as it is
     """
     body, channels, tree = layout.body, layout.channels, layout.body.tree
     rows, J, pushed = pixel_columns(layout, state, weight, shared)
@@ -361,7 +366,7 @@ def systematic_errors(
         w = closed.rows().weight
         soft = (w * ~closed.hard)[:, None] * closed.jacobian
         rest = rest + soft.T @ closed.jacobian
-    alone = covariance_alone(body, state, gram(J, pushed) + other_information)
+    alone = covariance_alone(body, state, gram(J, pushed) + others.information)
     of_axis = 2 * channels.source[rows.group] + np.arange(len(rows)) % 2
     push = np.ravel(noise.shared)[:, None] * gram(np.eye(2 * len(noise.shared))[of_axis], pushed)
 
@@ -388,10 +393,10 @@ def systematic_errors(
     by_shape = product(response, priors.root)
     shape = product(by_shape, by_shape.T)
     white = np.ones(len(dofs)), np.ones(joints.shape)
-    if averaged:
-        surplus = pushed_by(np.sqrt(np.maximum(assumed - np.square(noise.white), 0.0)))
-        surplus, information = gram(surplus, surplus) + others.surplus, gram(J, pushed) + other_information
-        white = _white_shares(body, state, averaged * information, averaged * surplus, moved)
+    if averaged is not None:
+        surplus = pushed_by(np.sqrt(np.maximum(averaged.assumed - np.square(noise.white), 0.0)))
+        surplus, information = gram(surplus, surplus) + others.surplus, gram(J, pushed) + others.information
+        white = _white_shares(body, state, averaged.frames * information, averaged.frames * surplus, moved)
     return SystematicErrors(
         dofs + shape, np.maximum(joints, 0.0), alone, np.concatenate([constant, by_shape], axis=1), drift, *white
     )

@@ -64,7 +64,8 @@ def fit_subject(
     TrackingError
         No frame shows enough of the person in two cameras.
     """
-    chosen = np.unique(np.linspace(0, len(channels.uv) - 1, min(max(frames, 1), len(channels.uv))).astype(int))
+    shown = np.flatnonzero(np.isfinite(channels.uv).any(axis=(1, 2)))
+    chosen = shown[np.unique(np.linspace(0, len(shown) - 1, min(max(frames, 1), len(shown))).astype(int))]
     if progress:
         progress("bone lengths", 0, 1)
     x = triangulated(channels, chosen)

@@ -17,7 +17,7 @@ from kinefit.errors import BodyError, ObservationError
 from kinefit.fitting.subject.parameters import Parameters, World
 from kinefit.geometry.losses import SQUARED, Loss, huber
 from kinefit.solving.equations import inverse
-from kinefit.solving.least_squares import MAX_DAMPING, descend
+from kinefit.solving.least_squares import MAX_DAMPING, Damping, descend
 
 RADIUS_STD = 0.2
 """Standard deviation of a radius' logarithm between people, as of cylinders' half axes."""
@@ -289,7 +289,7 @@ def _least_squares(
         collapsed[:] = np.flatnonzero((now.theta + step)[:radii] < lowest)
         return None if collapsed else at(now.theta + step)
 
-    end = descend(at(theta), solve, follow, iterations=iterations, tolerance=_TOLERANCE, damping=1e-3)
+    end = descend(at(theta), solve, follow, iterations=iterations, tolerance=_TOLERANCE, damping=Damping(1e-3))
     if collapsed and end.damping > MAX_DAMPING:
         problem = f"ball {collapsed[0] // 3 + 1} collapses: a radius falls below {np.exp(lowest):.2g} of its start"
         raise BodyError(problem, remedy="Give points all around the limb, or fewer balls.")

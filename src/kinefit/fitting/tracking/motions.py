@@ -156,14 +156,15 @@ def motion_of(
     provenance["length_std_m"] = subject.length_std
     alone = "filtered" if frames.markers is None else "each frame alone"
     provenance["estimate"] = "smoothed" if smooth else alone if lag is None else "fixed lag"
+    arrays = _arrays(last, body, len(results), frames.looked)
     return Motion(
-        body=body, rate=rate, times=frames.times, **_arrays(last, body, len(results)), residuals=residuals, up=up,
+        body=body, rate=rate, times=frames.times, **arrays, residuals=residuals, up=up,
         name=name, provenance=provenance, lasting=lasting,
     )  # fmt: skip
 
 
-def _arrays(results: Iterable[FrameResult], body: Body, frames: int) -> dict[str, Any]:
-    """Arrays of a motion of so many frames."""
+def _arrays(results: Iterable[FrameResult], body: Body, frames: int, looked: NDArray | None) -> dict[str, Any]:
+    """Arrays of a motion of so many frames; between two looks its quality is the lower one of both."""
     segments, D = len(body.tree.segments), len(body.tree.coordinates)
     shapes = {
         "Ts_world_root": (4, 4), "angles": (D,), "dof_std": (6 + D,), "joint_std": (segments, 3), "quality": (),
@@ -174,6 +175,12 @@ def _arrays(results: Iterable[FrameResult], body: Body, frames: int) -> dict[str
         out["Ts_world_root"][f], out["angles"][f] = r.state.T_world_root, r.state.angles
         for name in ("dof_std", "joint_std", "quality", "segment_quality"):
             out[name][f] = getattr(r, name)
+    if looked is not None and 0 < np.count_nonzero(looked) < frames:
+        at, skipped = np.flatnonzero(looked), np.flatnonzero(~looked)
+        after = np.searchsorted(at, skipped)
+        ends = [at[np.clip(k, 0, len(at) - 1)] for k in (after - 1, after)]
+        for name in ("quality", "segment_quality"):
+            out[name][skipped] = np.minimum(*(out[name][k] for k in ends))
     for array in out.values():
         array.flags.writeable = False  # for a motion to take them as they are
     return out

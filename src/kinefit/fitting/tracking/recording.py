@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from numbers import Real
 from typing import Any, get_args
 
@@ -157,6 +157,13 @@ class Recording:
         several = {f"{k.camera} {k.keypoint_set}": s for k, s in zip(keypoints, sigmas) if s != stated[k.camera]}
         known: dict[str, Any] = {"steps": partial(_seen_in, records, times), "sigma": stated | several}
         return cls(times, keypoints[0].rate, rig, keypoints=records, followed=one, **known | more)
+
+    @cached_property
+    def looked(self) -> NDArray:
+        """(F,) bool: steps at which a detector of keypoints looked at an image, or all where it skipped none."""
+        looks = [k.looked for k in self.keypoints if k.looked is not None]
+        all_looked = np.ones(len(self), bool)
+        return np.any(looks, axis=0) if looks and len(looks) == len(self.keypoints) else all_looked
 
     @property
     def sees_more(self) -> bool:

@@ -97,7 +97,7 @@ class _Frames:
         order = [self.place[i] for i in done]
         return TrackedSteps(
             self.results.chosen(order), recording.times[done], tracker, done,
-            not stopped and len(done) == len(recording),
+            not stopped and len(done) == len(recording), looked=recording.looked[done],
         )  # fmt: skip
 
 
@@ -150,7 +150,11 @@ def run(
 
     def step(tracker: Tracker, i: int, time: float) -> bool:
         guess = None if poses is None else poses.get(i)
-        found = tracker.update(recording.steps(i), time, others=others.at(time), guess=guess)
+        seen = recording.steps(i)
+        if not len(seen) and not recording.looked[i]:
+            found = tracker.between(time)
+        else:
+            found = tracker.update(seen, time, others=others.at(time), guess=guess)
         if found is not None:
             moving = {"measurements": found.measurements, "velocity": tracker.speed}
             frames.add(i, found.kept(tracker.scene_of(found.state, time).at(found.state, **moving)))

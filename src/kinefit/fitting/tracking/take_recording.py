@@ -25,6 +25,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
 from kinefit.observations import (
+    KEYPOINT_SIGMA,
     ClickFrame,
     DepthFrame,
     DepthVideo,
@@ -205,6 +206,11 @@ def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict
     out |= {name: sigma for of in seen.sensors for name, sigma in of.kind.sigma(of.entry).items()}
     out |= {f"clicks {video.sensor}": take.click_sigma for video in seen.clicks}
     out |= {entry.camera: entry.sigma for entry in (*take.skin, *take.keypoints)}
+    out |= {
+        f"{seen_by.camera} {seen_by.keypoint_set}": seen_by.sigma
+        for entry, seen_by in zip(take.keypoints, seen.keypoints)
+        if seen_by.sigma is not None and entry.sigma == KEYPOINT_SIGMA
+    }  # fmt: skip
     return out | {sensor_name("markers", take.markers, k): entry.sigma for k, entry in enumerate(take.markers)}
 
 

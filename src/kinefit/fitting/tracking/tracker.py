@@ -280,6 +280,14 @@ class Tracker:
         scene, measurements = self._scene_of(frames, state, time)
         return self._fit.run(scene, held, measurements, None if held is None else self._known(time))
 
+    def between(self, time: float) -> FrameResult | None:
+        """The body at a time [s] when no sensor looked, as it moved on; None until a start. Nothing is remembered."""
+        if self._prediction.state is None or self._time is None:
+            return None
+        steps = self._direction * (time - self._time) * self.rate
+        held = copy(self._prediction).ahead(min(steps, 10.0))
+        return self.fitted(time, (), held[0], held).result
+
     def scene_of(self, state: BodyState, time: float = 0.0) -> Scene:
         """The tracker's body in a state."""
         return self._scene.at(state, time=time)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from kinefit._jit import cache_directory
 from kinefit.errors import FileError, ObservationError
+from kinefit.images.detectors.layouts import BLAZEPOSE
 from kinefit.images.detectors.roi import MASK, PersonLandmarks, PoseModel, Roi, mean_with_mirrored
 
 _MAX_OVERLAP = 0.3  # intersection over union of two boxes; boxes that overlap more show the same object
@@ -179,6 +180,21 @@ class PersonDetector:
         """People in an RGB image (H, W, 3), in order of decreasing score."""
         return [DetectedPerson(b.points[:2], b.score, b.corners) for b in self._boxes(image, _MIN_PERSON_SCORE)]
 
+    def search(self, image: NDArray[np.uint8]) -> list[DetectedPerson]:
+        """Detect small or lying people in an image (H, W, 3) RGB, in order of decreasing score.
+
+        It is run on tiles of the image and, if these show none, on the image rotated by quarter turns. This search
+        gives more false positives.
+        """
+        people = []
+        for u, v, side in squares(image.shape[1], image.shape[0]):
+            part = self(image[v : v + side, u : u + side])
+            people += [replace(person, points=person.points + [u, v]) for person in part]
+        for quarters in () if people else (1, 3, 2):
+            turned = self(np.ascontiguousarray(np.rot90(image, quarters)))
+            people += [person.turned_back(quarters, image.shape[:2]) for person in turned]
+        return sorted(people, key=lambda person: -person.score)
+
 
 DETECTOR, LANDMARKS = "pose_detection.tflite", "pose_landmark_full.tflite"
 _REMEDY = "Delete its folder; kinefit then fetches it again."
@@ -201,6 +217,7 @@ class Models:
         Of another landmark network with the same inputs and outputs; default that of the folder.
     mirrored : bool
         Each crop is evaluated a second time, mirrored, and both results are averaged.
+    people : with the methods of `PersonDetector`, another detector of people; default that of the folder
 
     Raises
     ------
@@ -210,14 +227,16 @@ class Models:
         A file is missing, not a network, or a network of other inputs and outputs.
     """
 
+    layout = BLAZEPOSE
+
     def __init__(
         self, folder: str | PathLike[str], threads: int = 1, landmarks: str | PathLike[str] | None = None, *,
-        mirrored: bool = False,
+        mirrored: bool = False, people: Any = None,
     ) -> None:  # fmt: skip
         self._mirrored = mirrored
         self._landmarks, self._threads = Path(folder) / LANDMARKS if landmarks is None else Path(landmarks), threads
         self._points = _pose_model(self._landmarks, threads, without=MASK)
-        self._detect = PersonDetector(interpreter(Path(folder) / DETECTOR, threads))
+        self._detect = people or PersonDetector(interpreter(Path(folder) / DETECTOR, threads))
 
     @cached_property
     def _with_mask(self) -> PoseModel:
@@ -234,19 +253,8 @@ class Models:
         return self._detect(image)
 
     def search(self, image: NDArray[np.uint8]) -> list[DetectedPerson]:
-        """Detect small or lying people in an image (H, W, 3) RGB, in order of decreasing score.
-
-        The detector runs on tiles of the image and, if these show none, on the image rotated by quarter turns. This
-        search gives more false positives than `find_people`.
-        """
-        people = []
-        for u, v, side in squares(image.shape[1], image.shape[0]):
-            part = self._detect(image[v : v + side, u : u + side])
-            people += [replace(person, points=person.points + [u, v]) for person in part]
-        for quarters in () if people else (1, 3, 2):
-            turned = self._detect(np.ascontiguousarray(np.rot90(image, quarters)))
-            people += [person.turned_back(quarters, image.shape[:2]) for person in turned]
-        return sorted(people, key=lambda person: -person.score)
+        """Detect small or lying people in an image (H, W, 3) RGB; see `PersonDetector.search`."""
+        return self._detect.search(image)
 
 
 def squares(width: int, height: int) -> list[tuple[int, int, int]]:

@@ -1,248 +1,45 @@
-"""Detect and track the people in a video; each has a column of its own.
-
-The detector searches the whole image at the start, every half second, and when a person is lost. In between, each
-person is tracked: the last landmarks give the region of the next image in which the network looks for landmarks.
-"""
+"""Detect and track the people in a video: keypoints and masks of each in a column of its own."""
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.images.detectors.box_detector import DetectedPerson, Models
-from kinefit.images.detectors.roi import MIN_MASK, SIZE, Roi, Steady, cover, mask_runs, moved_mask, without_others
+from kinefit.images.detectors.box_detector import Models
+from kinefit.images.detectors.following import Follower, PersonDetection
+from kinefit.images.detectors.looking import Adder, SparseLooks
+from kinefit.images.detectors.networks import TopDownModels
 from kinefit.observations import Detections
 
-_MIN_PROBABILITY = 0.5  # of a person in a region
-_MIN_VISIBILITY = 0.65  # mean confidence of landmarks inside the image: people 0.71 and more, a pile of boxes 0.62
-_MIN_SEARCH_PROBABILITY = 0.9  # of detections from the tiled search
-_MIN_SEARCH_VISIBILITY = 0.75  # of detections from the tiled search: small people 0.78, machines 0.71
-_MAX_MASK_OVERLAP = 0.5  # share of a new person's mask that a tracked person may cover
-_MAX_DUPLICATE_DISTANCE = 0.05  # [sides of the region] median over the head, or all landmarks, of one person
-_MAX_RETURN_DISTANCE = 0.3  # [sides of the region] of the head from where the person was lost
 _MIN_FRAMES = 3  # that a person must be detected in; fewer are a false positive
 _MIN_DURATION = 0.2  # [s] the same
-_MIN_ROI_PX = 16  # smaller regions show too little to recognise a person
-_MAX_ROI_SIDES = 8  # of the image; larger regions show too little as well
-_HEAD = slice(0, 11)  # the landmarks of the face
-_SEARCH_INTERVAL = 0.5  # [s] between searches of the whole image
-_LOST_INTERVAL = 0.1  # [s] the same, while a person is lost
-_MAX_TIME_LOST = 2.0  # [s] for which a lost person keeps the column
-
-
-@dataclass(frozen=True, eq=False)
-class _DetectionTrack:
-    """Track of one person: the next region, and the last detection."""
-
-    column: int
-    steady: Steady
-    points: NDArray | None = None  # (33, 2) [px]
-    last: int = -1  # frame
-    shape: tuple[Roi, NDArray] | None = None  # last region, and the mask in it
-
-
-@dataclass(frozen=True, eq=False)
-class PersonDetection:
-    """One person in one image: column, landmarks (33, 2) [px], confidence (33,), runs of the mask, lifted (33, 3) [m].
-
-    hands: points (2, 21, 2) [px] and confidence (2, 21) of the left and the right hand; face: points (478, 2) [px] and
-    confidence (478,); None unless they were looked for.
-    """
-
-    column: int
-    points: NDArray
-    confidence: NDArray
-    runs: NDArray
-    lifted: NDArray
-    hands: tuple[NDArray, NDArray] | None = None
-    face: tuple[NDArray, NDArray] | None = None
-
-
-_Adder = Callable[[NDArray[np.uint8], list[PersonDetection]], list[PersonDetection]]
-
-
-@dataclass
-class Follower:
-    """Detects and tracks people in the images of one camera.
-
-    Parameters
-    ----------
-    models : Models
-    rate : float [Hz]
-    people : int
-        Largest number of people at a time.
-    masks : bool
-        Whether masks are computed.
-    """
-
-    models: Models
-    rate: float
-    people: int = 3
-    masks: bool = True
-    _tracks: list[_DetectionTrack] = field(default_factory=list)
-    _lost: list[_DetectionTrack] = field(default_factory=list)
-    _frame: int = -1
-    _columns: int = 0
-
-    def update(self, image: NDArray[np.uint8]) -> list[PersonDetection]:
-        """Detect the people in the next image (H, W, 3) uint8 RGB."""
-        self._frame += 1
-        self._lost = [t for t in self._lost if self._frame - t.last <= _MAX_TIME_LOST * self.rate]
-        crowd = len(self._tracks) > 1 or (self.people > 1 and self._is_due)  # their masks are needed
-        detected = self._follow(image, self.masks or crowd)
-        due = self._is_due
-        look = due or len(detected) < len(self._tracks) or not detected
-        self._tracks = [track for track, _ in detected]
-        if look and len(detected) < self.people:
-            detected += self._find(image, thorough=due)
-            self._tracks = [track for track, _ in detected]
-        return [sighting for _, sighting in detected]
-
-    @property
-    def _is_due(self) -> bool:
-        """Whether a search of the whole image is due."""
-        return self._frame % max(round((_LOST_INTERVAL if self._lost else _SEARCH_INTERVAL) * self.rate), 1) == 0
-
-    def _follow(self, image: NDArray[np.uint8], mask: bool) -> list[tuple[_DetectionTrack, PersonDetection]]:
-        """Update the tracks. Of two tracks of the same person, the one that moved less is kept."""
-        detected: list[tuple[_DetectionTrack, PersonDetection, float]] = []
-        for track in self._tracks:
-            others = [t.shape for t in self._tracks if t is not track and t.shape]
-            found = self._look_at(image, track, others=others, mask=mask)
-            if found is None:
-                self._lost.append(track)
-                continue
-            assert track.points is not None
-            moved = float(np.median(np.linalg.norm(found[1].points - track.points, axis=1)))
-            duplicate = next((k for k, s in enumerate(detected) if _is_same(s[0], found[0])), None)
-            if duplicate is None:
-                detected.append((*found, moved))
-                continue
-            if moved < detected[duplicate][2]:
-                self._lost.append(next(t for t in self._tracks if t.column == detected[duplicate][0].column))
-                detected[duplicate] = (*found, moved)
-            else:
-                self._lost.append(track)
-        return [s[:2] for s in detected]
-
-    def _find(self, image: NDArray[np.uint8], *, thorough: bool) -> list[tuple[_DetectionTrack, PersonDetection]]:
-        """Detect people without a track, in order of decreasing score, up to the largest number."""
-        found: list[tuple[_DetectionTrack, PersonDetection]] = []
-        covered = image
-        while len(self._tracks) + len(found) < self.people:
-            known = [*self._tracks, *(t for t, _ in found)]
-            covered = cover(covered, [t.shape for t in (known[-1:] if found else known) if t.shape])
-            new = self._first(image, self.models.find_people(covered), known)
-            if new is None and thorough and not known:
-                new = self._first(image, self.models.search(covered), known, searched=True)
-            if new is None:
-                break
-            column = self._column_of(new[0])
-            found.append((replace(new[0], column=column), replace(new[1], column=column)))
-        return found
-
-    def _first(
-        self,
-        image: NDArray[np.uint8],
-        people: list[DetectedPerson],
-        known: list[_DetectionTrack],
-        *,
-        searched: bool = False,
-    ) -> tuple[_DetectionTrack, PersonDetection] | None:
-        """The first new person that the landmark network confirms twice. The tiled search needs higher scores."""
-        score = _MIN_SEARCH_PROBABILITY if searched else _MIN_PROBABILITY
-        visibility = _MIN_SEARCH_VISIBILITY if searched else _MIN_VISIBILITY
-        for person in people:
-            first = self._look_at(image, _DetectionTrack(-1, Steady.at(person.points)), score, mask=False)
-            new = first and self._look_at(image, first[0], score, mask=self.masks or self.people > 1)
-            if new and _mean_visibility(new[1], image) >= visibility and not any(_is_tracked(new[0], t) for t in known):
-                return new
-        return None
-
-    def _column_of(self, new: _DetectionTrack) -> int:
-        """Column of the nearest lost person, if close enough; else a new column."""
-        lost = min(self._lost, key=lambda t: _distance(t, new, _HEAD), default=None)
-        if lost is not None and _distance(lost, new, _HEAD) < _MAX_RETURN_DISTANCE:
-            self._lost.remove(lost)
-            return lost.column
-        self._columns += 1
-        return self._columns - 1
-
-    def _look_at(
-        self, image: NDArray[np.uint8], track: _DetectionTrack, score: float = _MIN_PROBABILITY, *,
-        mask: bool, others: Sequence[tuple[Roi, NDArray]] = (),
-    ) -> tuple[_DetectionTrack, PersonDetection] | None:  # fmt: skip
-        """Detect a person's landmarks in the predicted region; None where there is no person.
-
-        The last masks of other people in the region are painted over: they attract the person's landmarks.
-        """
-        roi = track.steady.roi
-        if not _MIN_ROI_PX < roi.side < _MAX_ROI_SIDES * max(image.shape[:2]):
-            return None
-        pose = self.models.pose(without_others(roi.crop(image, SIZE), roi, track.shape, others), mask=mask)
-        if pose.score < score:
-            return None
-        points = roi.to_image(pose.points, SIZE)
-        ends = roi.to_image(np.stack([pose.middle, pose.rim]), SIZE)
-        steady = track.steady.follow(ends) if track.points is not None else Steady.at(ends)
-        runs = np.zeros(0, np.uint32)
-        if self.masks and pose.mask is not None:
-            runs = mask_runs(pose.mask, roi, image.shape[:2])
-        sighting = PersonDetection(
-            track.column, points, pose.visibility * pose.presence, runs, roi.to_upright(pose.lifted)
-        )
-        shape = None if pose.mask is None else (roi, pose.mask)
-        return replace(track, steady=steady, points=points, last=self._frame, shape=shape), sighting
-
-
-def _mean_visibility(detected: PersonDetection, image: NDArray) -> float:
-    """Mean confidence of the landmarks inside the image."""
-    inside = ((detected.points >= 0) & (detected.points < image.shape[1::-1])).all(axis=1)
-    return float(detected.confidence[inside].mean()) if inside.any() else 0.0
-
-
-def _is_same(a: _DetectionTrack, b: _DetectionTrack) -> bool:
-    return min(_distance(a, b, _HEAD), _distance(a, b, slice(None))) < _MAX_DUPLICATE_DISTANCE
-
-
-def _is_tracked(new: _DetectionTrack, known: _DetectionTrack) -> bool:
-    """Whether a new detection is a tracked person: most of its mask lies in theirs, or the landmarks agree."""
-    assert new.shape and known.shape
-    (roi, mask), (other_roi, other) = new.shape, known.shape
-    moved = moved_mask((roi, mask), other_roi) > 0
-    area = float((mask > MIN_MASK).sum()) * (roi.side / other_roi.side) ** 2
-    return bool((moved & (other > MIN_MASK)).sum() > _MAX_MASK_OVERLAP * area) or _is_same(new, known)
-
-
-def _distance(a: _DetectionTrack, b: _DetectionTrack, points: slice) -> float:
-    """Median distance of selected landmarks, in sides of the smaller region."""
-    assert a.points is not None and b.points is not None
-    side = min(a.steady.roi.side, b.steady.roi.side)
-    return float(np.median(np.linalg.norm(a.points[points] - b.points[points], axis=1))) / side
 
 
 def detect_people(
-    images: Iterable[NDArray[np.uint8]], models: Models, *, camera: str, rate: float, people: int = 3,
-    masks: bool = True, with_hands: _Adder | None = None, with_faces: _Adder | None = None,
+    images: Iterable[NDArray[np.uint8]], models: Models | TopDownModels, *, camera: str, rate: float, people: int = 3,
+    masks: bool = True, with_hands: Adder | None = None, with_faces: Adder | None = None, looks: range | None = None,
 ) -> Detections:  # fmt: skip
     """Detect and track people in a video: keypoints and masks.
 
     Parameters
     ----------
     images : (H, W, 3) uint8 RGB each, upright, in order.
-    models : Models
+    models : Models or TopDownModels
     camera : str
     rate : float [Hz]
     people : int
         Largest number of people at a time.
     masks : bool
-        Whether masks are computed.
+        Whether masks are computed, by networks that give them.
     with_hands, with_faces : callable, optional
         Adds hands, or faces, to the people in an image: a `HandFollower`, a `FaceFinder`.
+    looks : range, optional
+        Numbers of the images that are looked at for certain, others only where the motion or the people ask for it.
+        Default: all are looked at.
 
     Returns
     -------
@@ -250,33 +47,46 @@ def detect_people(
         One column for each person. A person who returns later than two seconds after leaving gets a new column.
         Detections of less than 0.2 s in total are dropped as false positives.
     """
-    follower = Follower(models, rate, people, masks)
-    frames: list[list[PersonDetection]] = []
     size = (0, 0)
-    for image in images:
-        size = (image.shape[1], image.shape[0])
-        detected = follower.update(image)
-        for add in filter(None, (with_hands, with_faces)):
-            detected = add(image, detected)
-        frames.append(detected)
-    times = Counter(s.column for frame in frames for s in frame)
+
+    def sized() -> Iterator[NDArray[np.uint8]]:
+        nonlocal size
+        for image in images:
+            size = (image.shape[1], image.shape[0])
+            yield image
+
+    def add(image: NDArray[np.uint8], detected: list[PersonDetection]) -> list[PersonDetection]:
+        for adder in filter(None, (with_hands, with_faces)):
+            detected = adder(image, detected)
+        return detected
+
+    follower, every = Follower(models, rate, people, masks), range(sys.maxsize)
+    seen = list(SparseLooks(follower, every if looks is None else looks, add).people(sized()))
+    looked = np.array([frame is not None for frame in seen], bool)
+    frames = [frame or [] for frame in seen]
+    times: Counter[int] = Counter()  # images, those before a look that were skipped included
+    for look, since in zip(np.flatnonzero(looked), np.diff(np.flatnonzero(looked), prepend=-1)):
+        times.update({s.column: int(since) for s in frames[look]})
     least = min(max(_MIN_FRAMES, round(_MIN_DURATION * rate)), len(frames) // 2)
     column = {c: k for k, c in enumerate(sorted(c for c in times if times[c] >= least))}
-    points = np.full((len(frames), len(column), 33, 2), np.nan)
-    confidence = np.zeros((len(frames), len(column), 33))
+    layout = models.layout
+    confidence = np.zeros((len(frames), len(column), len(layout.names)))
+    points, lifted = (np.full((*confidence.shape, axes), np.nan) for axes in (2, 3))
     counts = np.zeros((len(frames), len(column)), int)
-    lifted = np.full((len(frames), len(column), 33, 3), np.nan)
     runs = [np.zeros(0, np.uint32)]
     for f, frame in enumerate(frames):
         for s in sorted((s for s in frame if s.column in column), key=lambda s: s.column):
             at = f, column[s.column]
-            points[at], confidence[at], counts[at], lifted[at] = s.points, s.confidence, len(s.runs), s.lifted
+            points[at], confidence[at], counts[at] = s.points, s.confidence, len(s.runs)
+            if s.lifted is not None:
+                lifted[at] = s.lifted
             runs.append(s.runs)
     hands, hand_confidence = _stacked(frames, column, "hands", (2, 21)) if with_hands else (None, None)
     face, face_confidence = _stacked(frames, column, "face", (478,)) if with_faces else (None, None)
     return Detections(
         camera, rate, size, points, confidence, np.concatenate(runs), np.concatenate([[0], np.cumsum(counts)]), "",
-        lifted, hands, hand_confidence, None, face, face_confidence,
+        lifted if layout.has_masks else None, hands, hand_confidence, None, face, face_confidence,
+        layout.keypoint_set, layout.names, looked=None if looked.all() else looked,
     )
 
 

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.images.detectors.box_detector import BoxDetector, DetectedPerson, Models, interpreter
-from kinefit.images.detectors.detection import PersonDetection
-from kinefit.images.detectors.roi import SIZE, Roi, is_inside
+from kinefit.images.detectors.following import PersonDetection
+from kinefit.images.detectors.layouts import BLAZEPOSE, SIZE, PointLayout
+from kinefit.images.detectors.roi import Roi, is_inside
 
 FACES_NEAR, FACES_FAR = "face_detection_short_range.tflite", "face_detection_full_range_sparse.tflite"
 _CELLS_NEAR = ((8, 2), (16, 6))  # stride [px] of the feature maps, anchors in a cell
@@ -38,8 +39,6 @@ _PERSON_RADIUS = 0.25  # the same, in radii of the circle around a person
 _LANDMARK_RADIUS = 2.2  # the same, in distances of the outermost of nose, eyes and ears from their middle
 _MIN_RADIUS_PX = 12.0  # of the hidden circle
 _MAX_OUTLIER_RATIO = 8.0  # distance of a landmark of the head from the median, to the median distance; ears are nearer
-HEAD = slice(0, 11)
-"""Landmarks of MEDIAPIPE_33 on the face."""
 
 
 class FaceDetector:
@@ -100,7 +99,7 @@ class FaceDetector:
         pose = self._people.pose(person.roi.crop(part, SIZE), mask=False)
         if pose.score >= _MIN_LANDMARK_SCORE:
             points = person.roi.to_image(pose.points, SIZE)
-            return head_circles(points[None, HEAD]).tolist(), points
+            return head_circles(points[None, BLAZEPOSE.head]).tolist(), points
         if person.head is None or person.score < _MIN_UNCONFIRMED_SCORE:
             return [], np.zeros((0, 2))
         body = float(np.linalg.norm(np.diff(person.points, axis=0)))
@@ -148,7 +147,6 @@ _HEAD_SIDES = 1.8  # side of the first region in radii of the circle around the 
 _FACE_SIDES = 1.5  # side of a region in the extent of the mesh, as published
 _EYE_SIDES = 2.3  # the same in distances between the corners of an eye
 _MAX_SHIFT = 0.25  # from the circle around the head to the mesh's middle, in sides of the first region
-_EYES, _MOUTH = [2, 5], [9, 10]  # of MEDIAPIPE_33
 _TOP, _CHIN = 10, 152  # of MEDIAPIPE_478
 _CORNERS = ((33, 133), (362, 263))  # corners of the right and the left eye, from the image's left to its right
 _IRIS_ORDER = ([468, 469, 470, 471, 472], [473, 476, 475, 474, 477])  # middle, inner, top, outer, bottom
@@ -216,12 +214,12 @@ def around_face(points: NDArray) -> Roi:
     return Roi.around_points(points, points[_TOP] - points[_CHIN], _FACE_SIDES)
 
 
-def around_head(points: NDArray) -> Roi | None:
-    """The region of a person's face by the pose's landmarks (33, 2) [px]; None where they are not seen."""
-    circle = head_circles(points[None, HEAD])
-    if not len(circle):
+def around_head(points: NDArray, layout: PointLayout = BLAZEPOSE) -> Roi | None:
+    """The region of a person's face by the pose's landmarks (K, 2) [px]; None where they are not seen."""
+    circle = head_circles(points[None, layout.head])
+    if not len(circle) or not layout.eyes or not layout.below_eyes:
         return None
-    du, dv = points[_EYES].mean(axis=0) - points[_MOUTH].mean(axis=0)
+    du, dv = points[layout.eyes].mean(axis=0) - points[layout.below_eyes].mean(axis=0)
     return Roi(circle[0, :2], _HEAD_SIDES * float(circle[0, 2]), float(np.arctan2(du, -dv)))
 
 
@@ -230,6 +228,7 @@ class FaceFinder:
     """Finds the faces of people in an image; call it with an image and the people in it."""
 
     models: FaceModels
+    layout: PointLayout = BLAZEPOSE
 
     def __call__(self, image: NDArray[np.uint8], people: Sequence[PersonDetection]) -> list[PersonDetection]:
         """The people with their faces: points (478, 2) [px] and confidence (478,); NaN and 0 where none is seen."""
@@ -238,7 +237,7 @@ class FaceFinder:
     def _face(self, image: NDArray[np.uint8], landmarks: NDArray) -> tuple[NDArray, NDArray]:
         """A face where the pose has the head, looked at again in its own region."""
         points, confidence = np.full((478, 2), np.nan), np.zeros(478)
-        head = around_head(landmarks)
+        head = around_head(landmarks, self.layout)
         if head is None or not _MIN_FACE_PX < head.side < 4 * max(image.shape[:2]):
             return points, confidence
         found = self.models.landmarks(image, head)
@@ -269,7 +268,7 @@ _MIN_FOREARMS = 0.9  # side of that region in lengths of the forearm, for hands 
 _LANDMARK_EXTENTS = 1.6  # side of a region, in the extent of the landmarks
 _MAX_WRIST_DISTANCE = 0.5  # between the pose's wrist and the hand's, in sides of the region
 _MAX_DUPLICATE_DISTANCE = 0.25  # median over the landmarks of one hand detected twice, in sides of the region
-_ELBOWS, _WRISTS, _PINKIES, _INDEXES = (13, 14), (15, 16), (17, 18), (19, 20)  # of MEDIAPIPE_33, left and right
+_PALM_FOREARMS = 0.3  # from the wrist to the knuckles in lengths of the forearm, where no points are on the hand
 _WRIST, _MIDDLE = 0, 9  # wrist and knuckle of the middle finger, of MEDIAPIPE_HAND_21
 
 
@@ -333,10 +332,11 @@ def around_hand(points: NDArray) -> Roi:
     return Roi.around_points(points, points[_MIDDLE] - points[_WRIST], _LANDMARK_EXTENTS)
 
 
-def around_wrist(points: NDArray, side: int) -> Roi:
-    """Region of a person's left (0) or right (1) hand from the landmarks (33, 2) [px] of the body."""
-    wrist, elbow = points[_WRISTS[side]], points[_ELBOWS[side]]
-    palm, forearm = (points[_PINKIES[side]] + points[_INDEXES[side]]) / 2 - wrist, wrist - elbow
+def around_wrist(points: NDArray, side: int, layout: PointLayout = BLAZEPOSE) -> Roi:
+    """Region of a person's left (0) or right (1) hand from the landmarks (K, 2) [px] of the body."""
+    wrist, elbow = (points[layout.sides(part)[side]] for part in ("wrist", "elbow"))
+    forearm, fingers = wrist - elbow, [layout.sides(part)[side :: 2] for part in ("pinky", "index")]
+    palm = points[np.concatenate(fingers)].mean(axis=0) - wrist if all(fingers) else _PALM_FOREARMS * forearm
     du, dv = palm if np.linalg.norm(palm) > 0.15 * np.linalg.norm(forearm) else forearm
     width = max(_PALM_LENGTHS * np.linalg.norm(palm), _MIN_FOREARMS * np.linalg.norm(forearm))
     return Roi(wrist + _PALM_CENTRE * palm, float(width), float(np.arctan2(du, -dv)))
@@ -351,6 +351,7 @@ class HandFollower:
 
     models: HandModels
     _before: dict[tuple[int, int], HandLandmarks] = field(default_factory=dict)
+    layout: PointLayout = BLAZEPOSE
 
     def __call__(self, image: NDArray[np.uint8], people: Sequence[PersonDetection]) -> list[PersonDetection]:
         """Add hands to the people in an image (H, W, 3).
@@ -373,13 +374,15 @@ class HandFollower:
         alone = self._alone(image) if not now else {}
         now |= alone
         self._before = now
-        people = [*people, *([_unseen_person()] if alone else [])]
+        people = [*people, *([_unseen_person(self.layout)] if alone else [])]
         return [replace(person, hands=hands_of(now, person.column, image.shape)) for person in people]
 
     def _of_wrist(self, image: NDArray[np.uint8], person: PersonDetection, side: int) -> HandLandmarks | None:
         """Detect a hand near a person's wrist: in the region of the last image, else in that of the body's wrist."""
-        before, wrist = self._before.get((person.column, side)), person.points[_WRISTS[side]]
-        pose = around_wrist(person.points, side)
+        before, wrists = self._before.get((person.column, side)), self.layout.sides("wrist")
+        if not wrists or not self.layout.sides("elbow"):
+            return None
+        wrist, pose = person.points[wrists[side]], around_wrist(person.points, side, self.layout)
         for roi in (before.roi, pose) if before else (pose,):
             found = self._look(image, roi, twice=roi is pose)
             if found and np.linalg.norm(found.points[_WRIST] - wrist) < _MAX_WRIST_DISTANCE * max(pose.side, roi.side):
@@ -426,7 +429,8 @@ def hands_of(
     return points, confidence
 
 
-def _unseen_person() -> PersonDetection:
+def _unseen_person(layout: PointLayout) -> PersonDetection:
     """A person whose body is not in view."""
-    unseen = np.full((33, 2), np.nan), np.zeros(33), np.zeros(0, np.uint32), np.full((33, 3), np.nan)
+    K = len(layout.names)
+    unseen = np.full((K, 2), np.nan), np.zeros(K), np.zeros(0, np.uint32), np.full((K, 3), np.nan)
     return PersonDetection(HANDS_ONLY_COLUMN, *unseen)

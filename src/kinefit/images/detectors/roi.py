@@ -10,21 +10,17 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit.observations import MEDIAPIPE_33
+from kinefit.images.detectors.layouts import BLAZEPOSE, SIZE, PointLayout
 
-SIZE = 256  # [px] side of the network's image
 MASK = (1, SIZE, SIZE, 1)  # shape of the output that is the mask
-_LANDMARK_COUNT = 33  # of MEDIAPIPE_33; two more points give the region in the next image
+_LANDMARK_COUNT = len(BLAZEPOSE.names)  # two more points give the region in the next image
 _HEATMAP_PX = 64  # side
 _WINDOW_PX = np.arange(-3, 4)  # of a heatmap around a landmark
 _MIN_PEAK = 0.5  # probability in a heatmap that moves its landmark
-_MIN_SCORE = 0.5  # of somebody in the mirror image
 _MAX_EXCHANGED = 0.5  # of the median distance of both answers, left where sides are exchanged: one of them is wrong
 
-MIRROR = [
-    MEDIAPIPE_33.index(n.replace("left", "?").replace("right", "left").replace("?", "right")) for n in MEDIAPIPE_33
-]
-"""For each landmark the one on the other side."""
+MIRROR = BLAZEPOSE.mirror
+"""For each landmark of the built-in network the one on the other side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,17 +29,18 @@ class PersonLandmarks:
 
     Parameters
     ----------
-    points : (33, 2) [px of the crop]
-    visibility, presence : (33,) 0..1
+    points : (K, 2) [px of the crop]
+    visibility, presence : (K,) 0..1
         Probability that a landmark is not occluded; that it lies in the crop.
     middle, rim : (2,) [px of the crop]
-        Middle of the hips and a point above it on the circle around the body: they give the next region.
+        Middle of the body and a point above it on the circle around the body: they give the next region.
     score : float, 0..1
         Probability of a person.
-    mask : (256, 256) float32, probability that a pixel of the crop belongs to the person; None if not requested.
-    lifted : (33, 3) [m]
+    mask : (256, 256) float32, probability that a pixel of the crop belongs to the person; None if not requested, or
+        where the network gives none.
+    lifted : (K, 3) [m]
         Landmarks in space, from the middle of the hips, along the crop's u and v and away from the camera. Their scale
-        is the network's.
+        is the network's. None where the network gives none.
     """
 
     points: NDArray
@@ -53,7 +50,7 @@ class PersonLandmarks:
     rim: NDArray
     score: float
     mask: NDArray[np.float32] | None
-    lifted: NDArray
+    lifted: NDArray | None
 
 
 class PoseModel:
@@ -95,29 +92,32 @@ class PoseModel:
         )
 
 
-def mean_with_mirrored(seen: PersonLandmarks, mirrored: PersonLandmarks) -> PersonLandmarks:
+def mean_with_mirrored(
+    seen: PersonLandmarks, mirrored: PersonLandmarks, layout: PointLayout = BLAZEPOSE
+) -> PersonLandmarks:
     """Average the landmarks of a crop and of its mirror image: errors to one side cancel.
 
     Those of the crop are returned if the mirror image shows no person, or if left and right are swapped in it.
     """
 
     def back(points: NDArray) -> NDArray:
-        return np.column_stack([SIZE - 1 - points[:, 0], points[:, 1]])
+        return np.column_stack([layout.size[0] - 1 - points[:, 0], points[:, 1]])
 
-    points = back(mirrored.points)[MIRROR]
-    apart, exchanged = (np.median(np.linalg.norm(seen.points - p, axis=1)) for p in (points, points[MIRROR]))
-    if mirrored.score < _MIN_SCORE or exchanged < _MAX_EXCHANGED * apart:
+    order = layout.mirror
+    points = back(mirrored.points)[order]
+    apart, exchanged = (np.median(np.linalg.norm(seen.points - p, axis=1)) for p in (points, points[order]))
+    if mirrored.score < layout.limits[0] or exchanged < _MAX_EXCHANGED * apart:
         return seen
     ends = (np.stack([seen.middle, seen.rim]) + back(np.stack([mirrored.middle, mirrored.rim]))) / 2
-    mask = seen.mask
+    mask, lifted = seen.mask, seen.lifted
+    if lifted is not None and mirrored.lifted is not None:
+        lifted = (lifted + mirrored.lifted[order] * [-1, 1, 1]) / 2
     if mask is not None and mirrored.mask is not None:
         mask = (mask + mirrored.mask[:, ::-1]) * np.float32(0.5)
     return replace(
         seen, points=(seen.points + points) / 2, middle=ends[0], rim=ends[1],
-        visibility=(seen.visibility + mirrored.visibility[MIRROR]) / 2,
-        presence=(seen.presence + mirrored.presence[MIRROR]) / 2,
-        lifted=(seen.lifted + mirrored.lifted[MIRROR] * [-1, 1, 1]) / 2,
-        mask=mask,
+        visibility=(seen.visibility + mirrored.visibility[order]) / 2,
+        presence=(seen.presence + mirrored.presence[order]) / 2, lifted=lifted, mask=mask,
     )  # fmt: skip
 
 
@@ -186,21 +186,32 @@ class Roi:
         low, high = turned.min(axis=0), turned.max(axis=0)
         return cls(R @ (low + high) / 2, sides * float((high - low).max()), turn)
 
-    def A_image_crop(self, size: int) -> NDArray:
-        """Affine map (2, 3) from the pixels of a crop of `size` px to those of the image."""
-        scale = self.side / size
+    def A_image_crop(self, size: int | tuple[int, int]) -> NDArray:
+        """Affine map (2, 3) from the pixels of a crop to those of the image.
+
+        Parameters
+        ----------
+        size : side [px] of the crop, or its width and height: the region's side is then its height
+        """
+        width, height = (size, size) if isinstance(size, int) else size
+        scale = self.side / height
         c, s = scale * np.cos(self.turn), scale * np.sin(self.turn)
         linear = np.array([[c, -s], [s, c]])
-        return np.column_stack([linear, self.centre - linear @ [size / 2, size / 2]])
+        return np.column_stack([linear, self.centre - linear @ [width / 2, height / 2]])
 
-    def crop(self, image: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
-        """Crop the region from an image (H, W, 3): (size, size, 3) uint8; outside, the image's border is repeated."""
+    def crop(
+        self, image: NDArray[np.uint8], size: int | tuple[int, int], border: int = cv2.BORDER_REPLICATE
+    ) -> NDArray[np.uint8]:
+        """Crop the region from an image (H, W, 3): (height, width, 3) uint8 of `size`; see `A_image_crop`.
+
+        Outside, the image's border is repeated, or what `border` of OpenCV says.
+        """
         return cv2.warpAffine(
-            image, self.A_image_crop(size), (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REPLICATE,
+            image, self.A_image_crop(size), (size, size) if isinstance(size, int) else size,
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=border,
         )
 
-    def to_image(self, points_crop: NDArray, size: int) -> NDArray:
+    def to_image(self, points_crop: NDArray, size: int | tuple[int, int]) -> NDArray:
         """Points (N, 2) [px] in the image, from points of the crop of `size` px; any leading axes."""
         A = self.A_image_crop(size)
         return points_crop @ A[:, :2].T + A[:, 2]
@@ -243,6 +254,18 @@ class Steady:
         """Start the filter at points (2, 2) [px]."""
         return cls(points, points, np.zeros_like(points))
 
+    def over(self, points: NDArray, frames: int) -> Steady:
+        """Filter the points (2, 2) [px] of an image so many frames later, evenly on the way there in those between."""
+        out = self
+        for k in range(frames):
+            out = out.follow(self.raw + (k + 1) / frames * (points - self.raw))
+        return out
+
+    def ahead(self, frames: int) -> Steady:
+        """The filter so many frames later, as its points move on."""
+        radius = float(np.linalg.norm(self.raw[1] - self.raw[0]))
+        return self.over(self.raw + frames * 2 * radius * _PERIOD * self.speed, frames)
+
     def follow(self, points: NDArray) -> Steady:
         """Filter the points (2, 2) [px] of the next image."""
         radius = max(float(np.linalg.norm(points[1] - points[0])), 1e-6)
@@ -267,8 +290,18 @@ MIN_MASK = 0.5
 
 _MIN_COVERED_PROBABILITY = 0.3  # of a pixel that is painted over
 _DILATION = np.ones((7, 7), np.uint8)  # [px of the crop] of masks that are painted over
+_LIMB = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (15, 15))  # [px of the crop] of points on a body's outline
 _PAINT_GREY = 128
 _MIN_HIP_DISTANCE = 0.3  # [sides of the region] between two people; one person tracked twice has less
+
+
+def extent_mask(points: NDArray, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Mask (256, 256) of a region around points (N, 2) [px of its crop of a size]: their hull, and a limb's width."""
+    mask, (width, height) = np.zeros((SIZE, SIZE), np.float32), size
+    square = (points - [width / 2, height / 2]) * (SIZE / height) + SIZE / 2
+    if len(points):
+        cv2.fillConvexPoly(mask, cv2.convexHull(np.rint(square).astype(np.int32)), 1.0)
+    return np.asarray(cv2.dilate(mask, _LIMB), np.float32)
 
 
 def without_others(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import rgb_image
 from kinefit.errors import ObservationError
 from kinefit.images.detectors.box_detector import Models
-from kinefit.images.detectors.detection import Follower
+from kinefit.images.detectors.following import Follower
 from kinefit.observations import KeypointFrame
 
 FACE, LEFT_HAND, RIGHT_HAND = 0, 1, 2

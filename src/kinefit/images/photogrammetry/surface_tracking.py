@@ -157,7 +157,7 @@ class SurfaceTracker:
 
     def _append(self, points: SurfacePoints, added: SurfacePoints) -> SurfacePoints:
         """Append points, with the velocity of their nearest neighbours."""
-        shift = _values_of_nearest(points.uv[:, 0], self._velocity, added.uv[:, 0])
+        shift = self._velocity[_nearest(points.uv[:, 0], added.uv[:, 0])]
         self._velocity = np.concatenate([self._velocity, shift])
         return SurfacePoints(*(np.concatenate([a, b]) for a, b in zip(vars(points).values(), vars(added).values())))
 
@@ -391,8 +391,3 @@ class SurfaceTracker:
 def _nearest(points: NDArray, at: NDArray) -> NDArray[np.int64]:
     """(K,) index of the nearest of points (M, 2) to each of `at` (K, 2)."""
     return np.array([np.argmin(((points - place) ** 2).sum(axis=1)) for place in at], np.int64)
-
-
-def _values_of_nearest(points: NDArray, values: NDArray, at: NDArray) -> NDArray:
-    """Values (K, ...) of the nearest of points (M, 2) to each of `at` (K, 2)."""
-    return values[_nearest(points, at)] if len(at) else values[:0]

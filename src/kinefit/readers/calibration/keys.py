@@ -63,7 +63,7 @@ _HARMLESS = re.compile(
     r"err|rms|residual|std|deviation|sigma|covar|uncertain|^num|count|estimate|fix|flag|views|points|board|pattern|"
     r"square|vectors|matrices|roi|^new|optimal|rectif|projectionmatrix|resolutions|exposure|gain|plane|time"
 )
-"""Keys beside a camera that never change how it projects: quality, boards, settings of the program."""
+"""Further keys of a camera that never change how it projects: quality, boards, settings of the program."""
 _LENS_SIZES = (4, 5, 8, 12, 14)  # of OpenCV's vectors of distortion
 _FISHEYE = ("fisheye", "equidistant", "kannalabrandt", "kb4", "kb8")
 _OPENCV_LENS = re.compile(

@@ -16,7 +16,7 @@ from kinefit.readers.calibration.tables import numbers
 
 _KINDS_OF_PARTS = ("matrix", "distortion", "pose", "inverse pose", "lens model", "model")
 _PART = re.compile(r"(?:projection|distortion|mirror)(?:parameters)?|lens")
-"""Keys of tables within a camera's table, beside those of a quantity."""
+"""Keys of tables within a camera's table, other than those of a quantity."""
 _OF_PAIR = re.compile(r"(?:(M|K|mtx|camera_?[mM]atrix)|(D|dist|dist_?[cC]oeffs))_?([12])")
 
 
@@ -162,7 +162,7 @@ def _by_camera(tree: Table) -> Table:
 
 
 def _with_scalars(table: Table) -> Table:
-    """The table with fx, fy, cx, cy as a matrix, if it has only these, and `k` beside `K` as a distortion."""
+    """The table with fx, fy, cx, cy as a matrix, if it has only these, and `k` next to `K` as a distortion."""
     if "K" in table and "k" in table:  # a matrix and coefficients
         table = {"distortion" if key == "k" else key: value for key, value in table.items()}
     pinhole = [find(table, key) for key in ("fx", "fy", "cx", "cy")]

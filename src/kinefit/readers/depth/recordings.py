@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit._arguments import checked
+from kinefit._arguments import checked, renamed
 from kinefit._files import read_text
 from kinefit.errors import FileError, ObservationError, names_file
 from kinefit.observations.clocks import counted_times, frames_by_name
@@ -38,6 +38,7 @@ _MAX_ROUGHNESS = 0.1  # of a depth: median difference of neighbouring pixels; of
 _MAX_MULTIPLE_ERROR = 0.1  # of the stated rate to that of the times in names: a whole number
 
 
+@renamed(usual_rate="default_rate")
 @checked
 @names_file
 def read_depth(
@@ -46,7 +47,7 @@ def read_depth(
     sensor: str | None = None,
     unit: float | None = None,
     rate: float | None = None,
-    usual_rate: float | None = _DEFAULT_RATE,
+    default_rate: float | None = _DEFAULT_RATE,
     size: tuple[int, int] | None = None,
     range: tuple[float, float] = (0.0, np.inf),
     time_unit: float | None = None,
@@ -68,7 +69,7 @@ def read_depth(
         Of one count; default: as the file states, else 0.001 for whole numbers and 1 for float.
     rate : float [Hz], optional
         Default: as the file states or its times give.
-    usual_rate : float [Hz] or None
+    default_rate : float [Hz] or None
         For files without rate and times; None raises.
     size : (width, height) [px], of raw files.
     range : (near, far) [m]
@@ -89,7 +90,7 @@ def read_depth(
     path = Path(path)
     name = sensor or path.stem
     source = _source(path, name, size, unit)
-    times, rate, said = _times(source, rate, usual_rate, time_unit, time_offset, "depth images")
+    times, rate, said = _times(source, rate, default_rate, time_unit, time_offset, "depth images")
     notes = [*source.notes, *said]
     if unit is None and source.unit == 0.001 and not source.stated:
         likely, why = _unit_of_counts(path, source)
@@ -106,6 +107,7 @@ def read_depth(
     return replace(video, notes=tuple(notes))
 
 
+@renamed(usual_rate="default_rate")
 @checked
 @names_file
 def read_clouds(
@@ -114,7 +116,7 @@ def read_clouds(
     sensor: str | None = None,
     unit: float = 1.0,
     rate: float | None = None,
-    usual_rate: float | None = _DEFAULT_RATE,
+    default_rate: float | None = _DEFAULT_RATE,
     range: tuple[float, float] = (0.0, np.inf),
     time_unit: float | None = None,
     time_offset: float = 0.0,
@@ -125,7 +127,7 @@ def read_clouds(
 
     Parameters
     ----------
-    path, sensor, rate, usual_rate, time_unit, time_offset : as in `read_depth`
+    path, sensor, rate, default_rate, time_unit, time_offset : as in `read_depth`
     unit : float [m] of the files' coordinates
     range : (near, far) [m] distance from the sensor
     T_world_sensor : (4, 4) [m], optional
@@ -145,7 +147,7 @@ def read_clouds(
     name = sensor or path.stem
     names = tuple(file.name for file in files)
     source = images.DepthSource(len(files), lambda i: np.zeros((1, 1)), (1, 1), unit, names=names)
-    times, rate, said = _times(source, rate, usual_rate, time_unit, time_offset, "clouds")
+    times, rate, said = _times(source, rate, default_rate, time_unit, time_offset, "clouds")
     first = clouds.read_cloud(files[0])
     T = np.array(first.T_file_sensor if T_world_sensor is None else T_world_sensor, float)
     if T_world_sensor is None:
@@ -197,7 +199,7 @@ def _source(path: Path, name: str, size: tuple[int, int] | None, unit: float | N
 def _unit_of_counts(path: Path, source: images.DepthSource) -> tuple[float, str]:
     """Unit [m] of 16-bit counts that no file states, and what is worth saying of it; millimetres without evidence.
 
-    Lists of a TUM RGB-D folder beside the images state their convention. First Kinects keep three bits of each count
+    Lists of a TUM RGB-D folder next to the images state their convention. First Kinects keep three bits of each count
     for the number of a person: most counts are multiples of eight.
     """
     counts = [np.asarray(source.image(k)) for k in sorted({0, source.count // 2, source.count - 1})]
@@ -205,7 +207,7 @@ def _unit_of_counts(path: Path, source: images.DepthSource) -> tuple[float, str]
     if not len(values) or (values % 1 != 0).any():
         return 0.001, ""
     if any(_is_tum_list(folder / name) for folder in (path.parent, path) for name in _TUM_LISTS):
-        return 0.0002, "a list of a TUM RGB-D folder lies beside: unit = 0.0002 is taken; millimetres would be 0.001"
+        return 0.0002, "the folder has a list of TUM RGB-D: unit = 0.0002 is taken; millimetres would be 0.001"
     median = float(np.median(np.concatenate([image[image > 0] for image in counts])))
     if 0.001 * median <= _PERSON_DISTANCES[1]:
         return 0.001, ""

@@ -23,8 +23,7 @@ from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, SUFFI
 from kinefit.readers.depth.images import PICTURES, natural, npy_source, picture_source
 from kinefit.readers.depth.streams import has_depth_track
 from kinefit.readers.guess.names import camera_of
-from kinefit.readers.landmarks.keypoint_sets import SPLIT, other_keypoints
-from kinefit.readers.landmarks.keypoints import decode_openpose, read_keypoints
+from kinefit.readers.landmarks.keypoints import FRAME_NUMBER, decode_openpose, other_keypoints, read_keypoints
 from kinefit.readers.plugins import CALIBRATIONS, KEYPOINTS, MARKERS
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.videos.video import ENDINGS, ImageFolder, Video
@@ -43,7 +42,6 @@ DRAWN_ON = re.compile(r"(?<![a-z])(?:pose|overlay|labell?ed|annotated|results?|d
 _RESULT_ENDINGS = ("-kinefit", "-detect")  # of the folders that kinefit writes
 _MAX_DEPTH = 6  # folders below the given one
 _MIN_SEQUENCE = 12  # numbered json files in one folder are a detector's frames, fewer may be cameras
-_JSON_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.I)
 _MAYBE_KEYPOINTS = (".json", ".csv", ".h5")
 _CALISCOPE_COLUMNS = ("sync_index", "port", "point_id", "img_loc_x", "img_loc_y")
 _CALIBRATION_NAME = re.compile(r"calib|intrin|extrin|cam", re.IGNORECASE)  # else a broken file may be anything
@@ -159,7 +157,7 @@ def find_calibrations(
 
 
 def _numbered(path: Path) -> bool:
-    return bool(_JSON_NUMBER.search(path.name))
+    return bool(FRAME_NUMBER.search(path.name))
 
 
 def _by_folder(files: list[Path]) -> list[tuple[Path, list[Path]]]:
@@ -315,7 +313,7 @@ def stand_in(path: Path) -> str:
 
 def find_markers(files: list[Path], faults: list[KinefitError]) -> list[Path]:
     """Files of markers; errors of plug-ins are added to `faults`."""
-    return [path for path in files if MARKERS.name_of(path, faults)]
+    return [path for path in files if MARKERS.name_of(path, faults) and not KEYPOINTS.name_of(path, faults)]
 
 
 def find_keypoints(files: list[Path], faults: list[KinefitError]) -> tuple[list[KeypointFile], list[str]]:
@@ -333,21 +331,24 @@ def find_keypoints(files: list[Path], faults: list[KinefitError]) -> tuple[list[
     for path in files:
         suffix = path.suffix.lower()
         shape = _array_shape(path) if suffix == ".npy" else None
-        if shape is not None and len(shape) == 3 and shape[1:] in ((33, 3), (75, 3)):
-            found.append(KeypointFile(path, "mediapipe", shape[0], shape[1]))
-        elif suffix == ".csv" and (frames := _caliscope_frames(path)):
-            found.append(KeypointFile(path, "caliscope", frames, 33))
-        elif (format := KEYPOINTS.name_of(path, faults)) and KEYPOINTS.plugins(format):
+        format = KEYPOINTS.name_of(path, faults)
+        if shape is not None and format in ("mediapipe", "freemocap"):
+            found.append(KeypointFile(path, format, *shape[-3:-1]))
+        elif format == "caliscope":
+            found += [KeypointFile(path, format, frames, 33)] if (frames := _caliscope_frames(path)) else []
+        elif format == "deeplabcut" and path.with_suffix(".csv") in files and suffix == ".h5":
+            continue  # both are of one result
+        elif format:
             try:
                 record = read_keypoints(path, format=format, camera=path.stem, rate=1.0)
                 found.append(KeypointFile(path, format, len(record), len(record.names)))
             except KinefitError as error:
                 faults.append(error)
         elif shape is not None and len(shape) >= 3 and shape[-1] in (2, 3):
-            known = "landmarks are read as (frames, 33, 3), or (frames, 75, 3) with hands"
+            known = "landmarks in images are read as (frames, 33, 3), or (frames, 75, 3) with hands"
             remarks.append(f"{path.name}: an array of shape {shape}; {known}")
         elif suffix in _MAYBE_KEYPOINTS and (other := other_keypoints(path)):
-            remarks.append(f"{path.name}: {other}; not used. {SPLIT}")
+            remarks.append(f"{path.name}: {other}; not used")
     return found, remarks
 
 
@@ -356,7 +357,7 @@ def _openpose_points(numbered: list[Path]) -> int | None:
     is_openpose = False
     for path in numbered:
         try:
-            people = decode_openpose(path.read_bytes()).people
+            people = decode_openpose(path.read_bytes())
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OSError):
             if not is_openpose:
                 return None

@@ -155,7 +155,7 @@ def _describe_depth(draft: Draft, files: Sequence[Path], videos: Sequence[Path],
 def _depth_of(path: Path) -> tuple[DepthVideo, dict[str, Value]]:
     """A recording of depth, and its entry `rate` where no file states one."""
     try:
-        return read_depth(path, usual_rate=None), {}
+        return read_depth(path, default_rate=None), {}
     except ObservationError:
         video = read_depth(path)
         return video, {"rate": Value(video.rate, "guess", "that of nearly every depth camera: its files state none")}
@@ -199,7 +199,9 @@ def _choose_calibration(
             remedy=f"{fault.remedy or ''} {_CALIBRATE}".strip(),
         )
     if not found:
-        if videos and not keypoints:
+        if videos and (not keypoints or len(videos) == 1):
+            for path in keypoints:
+                draft.note("keypoints", "open", f"{draft.name(path)}: not used without a calibration of its camera")
             if singles:
                 draft.note("calibration", "open", f"{draft.name(singles[0])} has one camera only: not used")
             describe_uncalibrated(draft, _of_one_moment(draft, videos))

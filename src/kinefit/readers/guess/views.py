@@ -296,6 +296,7 @@ def _point(names: Sequence[str], side: str, joint: str) -> int | None:
 Source = dict[str, KeypointFile]  # camera -> its file, of one detector
 
 _AMBIGUOUS_COUNTS = (25, 25 + 2 * HAND_POINTS)  # points of BODY_25 and BODY_25B, without hands and with them
+_STEPS_OF_POSE2SIM = ("pose-sync", "pose/", "pose-associated")  # folders: synchronised first, then with all people
 _MAX_LENGTH_ERROR = 0.1  # share of the video's frames; keypoints with a larger error are of another recording
 
 
@@ -317,10 +318,12 @@ def keypoint_sources(
         groups = [trial for trial in groups if len(trial.files) > 1]
         counts = {trial.place: min(of[path].frames for path in trial.files.values()) for trial in groups}
 
-        def rank(trial: Trial, counts: Mapping[str, int] = counts) -> tuple[bool, bool, int, int]:
+        def rank(trial: Trial, counts: Mapping[str, int] = counts) -> tuple[bool, bool, int, int, int]:
             off = abs(counts[trial.place] - frames) if frames else -counts[trial.place]
             shared = -common_words(trial.place, place)
-            return bool(STATIC.search(trial.place)), bool(frames) and off > _MAX_LENGTH_ERROR * frames, shared, off
+            step = next((k for k, word in enumerate(_STEPS_OF_POSE2SIM) if word in trial.place), 1)
+            other = bool(frames) and off > _MAX_LENGTH_ERROR * frames
+            return bool(STATIC.search(trial.place)), other, shared, step, off
 
         for trial in sorted(groups, key=rank)[:1]:
             if frames and abs(counts[trial.place] - frames) > _MAX_LENGTH_ERROR * frames:

@@ -1,4 +1,4 @@
-"""The file of the built-in detector, `*.npz`, version 1: people of one video, their landmarks and masks.
+"""The file of `kinefit detect`, `*.npz`, version 1: people of one video, their landmarks and masks.
 
 A compressed archive of numpy arrays (`numpy.load(path, allow_pickle=False)` reads it); F frames, P people, pixels of
 the video's image, the centre of the first pixel is (0, 0):
@@ -9,15 +9,19 @@ the video's image, the centre of the first pixel is (0, 0):
     camera ()                  text
     rate ()                    [Hz]
     size (2,)                  width, height [px]
-    points (F, P, 33, 2)       float32 [px], landmarks of MEDIAPIPE_33; NaN where a person is not detected
-    confidence (F, P, 33)      float32, 0..1; 0 where a person is not detected
+    points (F, P, K, 2)        float32 [px], landmarks; NaN where a person is not detected
+    confidence (F, P, K)       float32, 0..1; 0 where a person is not detected
+    names (K,)                 text, optional: names of the landmarks; without, the 33 of MEDIAPIPE_33
+    keypoint_set ()            text, with names: the set that they are of, "" for landmarks of the body
+    network ()                 text, optional: file of a network of one's own that found them
     mask_runs (N,)             uint32, run lengths down the columns, beginning outside of the person (COCO's RLE)
-    lifted (F, P, 33, 3)       float32 [m], optional: landmarks in space, see Detections; NaN where not detected
+    lifted (F, P, K, 3)        float32 [m], optional: landmarks in space, see Detections; NaN where not detected
     hands (F, P, 2, 21, 2)     float32 [px], optional: landmarks of MEDIAPIPE_HAND_21 of the left and the right hand
     hand_confidence (F, P, 2, 21)   float32, 0..1, with hands; 0 where a hand is not detected
     face (F, P, 478, 2)        float32 [px], optional: points of MEDIAPIPE_478; NaN where a face is not detected
     face_confidence (F, P, 478)     float32, 0..1, with face; 0 where a face is not detected
     times (F,)                 float64 [s], optional: when each frame is shown, from the first on; without: at the rate
+    looked (F,)                bool, optional: frames whose image was looked at; without: all
     mask_starts (F * P + 1,)   start of each mask in mask_runs, by frame, then person; two equal starts: no mask
 """
 
@@ -26,6 +30,7 @@ from __future__ import annotations
 from glob import escape
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,11 +71,14 @@ def read_detections(path: str | PathLike[str]) -> Detections:
         raise FileError(problem, file=file, remedy=again) from error
     try:
         width, height = (int(n) for n in arrays["size"])
+        optional = ("lifted", "hands", "hand_confidence", "times", "face", "face_confidence", "looked")
+        more: dict[str, Any] = {name: arrays.get(name) for name in optional}
+        if "names" in arrays:
+            more |= {"keypoint_set": str(arrays["keypoint_set"]), "names": tuple(map(str, arrays["names"]))}
         found = Detections(
             str(arrays["camera"]), float(arrays["rate"]), (width, height), arrays["points"], arrays["confidence"],
-            arrays["mask_runs"], arrays["mask_starts"], str(file), arrays.get("lifted"),
-            *(arrays.get(name) for name in ("hands", "hand_confidence", "times", "face", "face_confidence")),
-        )
+            arrays["mask_runs"], arrays["mask_starts"], str(file), network=str(arrays.get("network", "")), **more,
+        )  # fmt: skip
     except (KinefitError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
         raise FileError(f"its arrays do not fit together ({error})", file=file, remedy=again) from error
     if not found.rate > 0 or not np.isfinite(found.confidence).all() or np.isinf(found.points).any():
@@ -78,10 +86,13 @@ def read_detections(path: str | PathLike[str]) -> Detections:
     return found
 
 
-def detections_key(path: str | PathLike[str]) -> str | None:
-    """The key of a file of detections (its video, networks and settings); None if it is missing or damaged."""
+def detections_key(path: str | PathLike[str], part: str = "key") -> str | None:
+    """The key of a file of detections (its video, networks and settings); None if it is missing or damaged.
+
+    `part` may be another text of the file.
+    """
     try:
-        return str(_load(Path(path), "key")["key"])
+        return str(_load(Path(path), part)[part])
     except (FileError, *_DAMAGE):
         return None
 

@@ -1,4 +1,4 @@
-"""Names of the points of detectors, in each one's order, and arrays of them; files of other programs, refused."""
+"""Names of the points of detectors, in each one's order, and arrays of them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._mapped import kept
-from kinefit.errors import ObservationError, check_choice
+from kinefit.errors import ObservationError, check_choice, shortened
 from kinefit.observations import MEDIAPIPE_33, MEDIAPIPE_75, MEDIAPIPE_478, Keypoints
 from kinefit.observations.arrays import sealed
+from kinefit.observations.detections import OPENPOSE_HAND_42
 from kinefit.observations.recordings import check_pixels, confidence_of
 
 if TYPE_CHECKING:
@@ -24,11 +25,6 @@ _FACE_ARMS_LEGS = (
 )
 
 _FEET = "LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel"
-_FINGERS = "Thumb Index Middle Ring Little"
-_HANDS = tuple(
-    f"{side}Hand{point}" for side in "LR"
-    for point in ("Wrist", *(f"{finger}{k}" for finger in _FINGERS.split() for k in range(1, 5)))
-)  # fmt: skip
 _BODY_25 = tuple(
     "Nose Neck RShoulder RElbow RWrist LShoulder LElbow LWrist MidHip RHip RKnee RAnkle LHip LKnee LAnkle "
     "REye LEye REar LEar LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel".split()
@@ -40,10 +36,11 @@ KEYPOINT_SETS: dict[str, tuple[str, ...]] = {
         "UpperNeck", "HeadTop", *_FEET.split(),
     ),
     "BODY_25": _BODY_25,
-    "BODY_25_HANDS": (*_BODY_25, *_HANDS),
+    "BODY_25_HANDS": (*_BODY_25, *OPENPOSE_HAND_42),
     "COCO_17": tuple(_FACE_ARMS_LEGS.split()),
+    "COCO_18": tuple(name for name in _BODY_25[:19] if name != "MidHip"),
     "COCO_WHOLEBODY_133": (
-        *_FACE_ARMS_LEGS.split(), *_FEET.split(), *(f"Face{k}" for k in range(68)), *_HANDS,
+        *_FACE_ARMS_LEGS.split(), *_FEET.split(), *(f"Face{k}" for k in range(68)), *OPENPOSE_HAND_42,
     ),
     "HALPE_26": (
         *_FACE_ARMS_LEGS.split(),
@@ -79,32 +76,6 @@ def keypoint_names(keypoint_set: str) -> tuple[str, ...]:
     return KEYPOINT_SETS[keypoint_set]
 
 
-_OTHER_FILES = {  # what such a file has near its start, after spaces: what it is
-    rb"\[\s*\{(?=.*\"image_id\")(?=.*\"keypoints\")": "AlphaPose's or COCO's results, a list of all frames' people",
-    rb"\{\s*\"[^\"]*\.(?:jpg|jpeg|png)\"\s*:": "AlphaPose's results, all frames' people by image",
-    rb"(?=.*\"(?:instances|instance_info)\")": "MMPose's predictions, all frames' people",
-    rb"\{(?=.*\"(?:annotations|categories|file_name)\")": "COCO's annotations of many images",
-    rb"scorer,.*\nbodyparts,|scorer,.*\nindividuals,": "DeepLabCut's keypoints, a table of all frames",
-    rb"\x89HDF\r\n": "keypoints of DeepLabCut or SLEAP, or another HDF5 file",
-}
-_MAX_START_BYTES = 4096  # in which these are
-SPLIT = 'Write one file a frame, NAME_0000.json: {"people": [{"pose_keypoints_2d": [x, y, confidence, ...]}]}.'
-"""How keypoints of other programs are to be written."""
-
-
-def other_keypoints(path: Path) -> str:
-    """What a file of another program's keypoints is; "" for any other file."""
-    with path.open("rb") as file:
-        start = file.read(_MAX_START_BYTES).lstrip()
-    return next((what for pattern, what in _OTHER_FILES.items() if re.match(pattern, start, re.DOTALL)), "")
-
-
-def refuse_other_keypoints(path: Path) -> None:
-    """Raise ObservationError for a file of another program's keypoints."""
-    if other := other_keypoints(path):
-        raise ObservationError(f"{other}, which are not read", file=path, remedy=SPLIT)
-
-
 _BONES = (
     ("Nose", "LEye"), ("Nose", "REye"), ("LEye", "LEar"), ("REye", "REar"), ("LHip", "RHip"),
     ("LShoulder", "RShoulder"), *((f"{side}{a}", f"{side}{b}") for side in "LR" for a, b in (
@@ -129,6 +100,38 @@ def cut_frames(items: Any, frames: tuple[int, int] | None, file: Path) -> tuple[
         problem = f"frames [{frames[0]}, {frames[1]}] of {len(items)}"
         raise ObservationError(problem, file=file, remedy=f"Give frames within [0, {len(items)}].")
     return items[frames[0] : frames[1]], frames[0]
+
+
+_MAX_GAPS = 100, 10_000
+"""Frames for each that is there, and at least, beyond which their numbers are not those of a recording."""
+
+
+def frame_numbers(values: Sequence[float] | NDArray, what: str = "frame", *, from_first: bool = False) -> NDArray:
+    """(N,) int of a table's frame numbers, counted from the smallest if wanted.
+
+    Raises
+    ------
+    ObservationError
+        They are no whole numbers, or too far apart.
+    """
+    numbers = np.asarray(values, float)
+    if (wrong := ~np.isfinite(numbers) | (numbers < 0) | (numbers > 2**31) | (numbers % 1 != 0)).any():
+        problem = f"{what} = {numbers[wrong][0]:g}"
+        raise ObservationError(problem, remedy="They are whole numbers from 0 on: export the table again.")
+    numbers = numbers - numbers.min() if from_first and len(numbers) else numbers
+    there, last = len(np.unique(numbers)), float(numbers.max(initial=0.0))
+    if last > _MAX_GAPS[0] * there + _MAX_GAPS[1]:
+        problem = f"{there} frames in {last + 1:.0f} of {what}"
+        raise ObservationError(problem, remedy="The numbers of frames follow each other: export the table again.")
+    return numbers.astype(int)
+
+
+def stacked(people: Sequence[NDArray], points: int) -> NDArray:
+    """(F, P, K, 3) x, y [px], confidence of the people of every frame, each (P of the frame, K, 3); else zeros."""
+    data = np.zeros((len(people), max(map(len, people), default=0), points, 3))
+    for row, persons in zip(data, people, strict=True):
+        row[: len(persons)] = persons
+    return data
 
 
 def face_mesh(data: NDArray) -> NDArray:
@@ -174,13 +177,52 @@ def _mean_bone(uv: NDArray, names: Sequence[str]) -> float:
     return float(np.nanmedian(lengths[:, known], axis=0).mean()) if known.any() else np.inf
 
 
+_SIDE = re.compile(
+    r"(?i:^(left|right)[\W_]*|[\W_]*(left|right)$|^([lr])[\W_]+|[\W_]+([lr])$)|^([LR])(?=[A-Z])|(?<=[a-z])([LR])$"
+)  # of a name in the spellings of people and programs: left_knee, LKnee, l-knee, KneeLeft, knee_L
+
+
+def _spelled(name: str) -> tuple[str, str]:
+    """Side, "l", "r" or "", and the rest of a name in small letters, which are alike in all spellings."""
+    side = _SIDE.search(name)
+    letter = next(filter(None, side.groups()))[0].lower() if side else ""
+    return letter, re.sub(r"[\W_]+", "", _SIDE.sub("", name, count=1)).lower()
+
+
+def known_set(names: Sequence[str], keypoint_set: str | None, file: Path) -> tuple[str, list[int]]:
+    """The keypoint set that has points of these names, in any spelling, and the index of each in it.
+
+    Parameters
+    ----------
+    keypoint_set : that the user states, one of `KEYPOINT_SETS`; default: the smallest that has all of them
+
+    Raises
+    ------
+    ObservationError
+        Names that no set has, listed; two of one point.
+    """
+    best, unknown = "", list(names)
+    for name in [keypoint_set] if keypoint_set else sorted(KEYPOINT_SETS, key=lambda name: len(KEYPOINT_SETS[name])):
+        at = {_spelled(point): k for k, point in enumerate(keypoint_names(name))}
+        missing = [own for own in names if _spelled(own) not in at]
+        if not missing and len({_spelled(own) for own in names}) == len(names) > 0:
+            return name, [at[_spelled(own)] for own in names]
+        if not best or len(missing) < len(unknown):
+            best, unknown = name, missing
+    those = f"names of no point of {best}: {shortened(', '.join(unknown), 200)}"
+    problem = those if unknown else "two names of one point, or no point"
+    remedy = 'Write names = { OWN = "NAME of the set" } into [[keypoints]], "" to leave a point out; or set = a set of '
+    raise ObservationError(problem, file=file, remedy=f"{remedy}your own body's, whose points have these names.")
+
+
 def keypoint_record(
     data: NDArray, camera: str, keypoint_set: str, rate: float, time_offset: float, start: int, source: Path,
-    image_frame: ImageFrame | None,
+    image_frame: ImageFrame | None, names: Sequence[str] = (),
 ) -> Keypoints:  # fmt: skip
     """Make a record of (F, P, K, 3) x, y [px], confidence 0..1; zeros where a point was not detected.
 
-    rate [Hz], time_offset [s]; raises ObservationError for a rate that is not positive, and what `Keypoints` raises.
+    rate [Hz], time_offset [s], names of the points if the set is the user's own; raises ObservationError for a rate
+    that is not positive, and what `Keypoints` raises.
     """
     if not rate > 0 or not np.isfinite(rate):
         raise ObservationError(f"rate {rate} Hz", file=source, remedy="Give a positive frame rate.")
@@ -193,5 +235,5 @@ def keypoint_record(
     points = sealed(kept(np.where(seen[..., None], points, np.nan)))
     confidence = sealed(kept(np.where(seen, confidence, 0.0)))
     offset = time_offset + start / rate
-    names = keypoint_names(keypoint_set)
+    names = tuple(names) or keypoint_names(keypoint_set)
     return Keypoints(camera, keypoint_set, names, rate, points, confidence, time_offset=offset, source=str(source))

@@ -1,45 +1,52 @@
-"""Read 2D keypoints of detectors: OpenPose json folders, MediaPipe arrays, caliscope tables."""
+"""Read 2D keypoints of detectors: OpenPose json folders, MediaPipe and FreeMoCap arrays, caliscope tables."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit._files import read_bytes, read_npy, read_table
+from kinefit._files import npy_header, read_bytes, read_npy, read_table
 from kinefit._mapped import kept
 from kinefit.errors import FileError, ObservationError, choices, names_file
 from kinefit.observations import Keypoints
 from kinefit.observations.arrays import sealed
 from kinefit.observations.clocks import frames_by_name
 from kinefit.readers.depth.images import natural
-from kinefit.readers.landmarks import keypoint_sets
 from kinefit.readers.landmarks.keypoint_sets import (
     FACE_POINTS,
+    FACE_SET,
     HAND_POINTS,
     KEYPOINT_SETS,
     MEDIAPIPE_SETS,
     OPENPOSE_HANDS,
+    SET_OF_COUNT,
     cut_frames,
     face_mesh,
+    frame_numbers,
     in_right_order,
     keypoint_names,
     keypoint_record,
+    stacked,
 )
 from kinefit.readers.plugins import KEYPOINTS, FileFormat
 
 if TYPE_CHECKING:
     from kinefit.geometry.camera import ImageFrame
 
+_Decoded = TypeVar("_Decoded")
+_FREEMOCAP = (33, 3), (75, 3), (553, 3)  # last dimensions of its arrays: points, and x, y, z
 _MISSING_HAND = [0.0] * (3 * HAND_POINTS)
-_FRAME_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.IGNORECASE)
+FRAME_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.IGNORECASE)
+"""At the end of the name of a file of one frame."""
 
 
 class OpenPosePerson(msgspec.Struct):
@@ -55,11 +62,29 @@ class OpenPosePerson(msgspec.Struct):
         return [*self.pose_keypoints_2d, *left, *right]
 
 
-class _OpenPoseFrame(msgspec.Struct):
-    people: list[OpenPosePerson]
+class OpenPoseFrame(msgspec.Struct):
+    """All people of a frame; an empty object is nobody (Pose2Sim's `pose-associated`)."""
+
+    people: list[msgspec.Raw]
+
+    def persons(self) -> list[OpenPosePerson]:
+        """Those who are there; raises msgspec.DecodeError."""
+        return [_PERSON.decode(one) for one in self.people if bytes(one)[1:-1].strip()]
 
 
-decode_openpose = msgspec.json.Decoder(_OpenPoseFrame).decode
+_PERSON, _FRAME = msgspec.json.Decoder(OpenPosePerson), msgspec.json.Decoder(OpenPoseFrame)
+_OLD_KEY = re.compile(rb'"(pose|hand_left|hand_right)_keypoints"')
+
+
+def with_new_keys(raw: bytes) -> bytes:
+    """JSON with today's keys in place of those of old versions of OpenPose, and of AlphaPose's form "cmu"."""
+    raw = raw.replace(b'"bodies"', b'"people"').replace(b'"joints"', b'"pose_keypoints_2d"')
+    return _OLD_KEY.sub(rb'"\1_keypoints_2d"', raw)
+
+
+def decode_openpose(raw: bytes) -> list[OpenPosePerson]:
+    """All people of one frame; raises msgspec.DecodeError."""
+    return _FRAME.decode(with_new_keys(raw)).persons()
 
 
 @checked
@@ -101,21 +126,34 @@ def read_openpose(
     """
     folder = Path(folder)
     paths, start = cut_frames(_numbered_files(folder), frames, folder)
-    read = [_read_people(path) for path in paths]
-    first = next((len(people[0].pose_keypoints_2d) // 3 for people in read if people), 0)
-    named = keypoint_set or keypoint_sets.SET_OF_COUNT.get(first, "BODY_25B")
-    names = keypoint_names(named)
-    people = [_numbers(persons, path, named) for persons, path in zip(read, paths, strict=True)]
-    if folder.is_dir() and not any(map(len, people)):
-        raise ObservationError(
-            f"no person is detected in any of the {len(paths)} frames of camera {camera}",
-            remedy="Check that the detector ran on this camera's video, or remove this camera.",
-        )
-    data = np.zeros((len(people), max(map(len, people)), len(names), 3))
-    for row, persons in zip(data, people, strict=True):
-        row[: len(persons)] = persons
-    record = keypoint_record(data, camera, named, rate, time_offset, start, folder, image_frame)
+    people = [decoded(path, decode_openpose, "openpose") for path in paths]
+    places = [(path, "") for path in paths]
+    return people_record(people, places, folder, camera, rate, keypoint_set, time_offset, start, image_frame)
+
+
+def people_record(
+    people: Sequence[Sequence[OpenPosePerson]], places: Sequence[tuple[Path, str]], source: Path, camera: str,
+    rate: float, keypoint_set: str | None, time_offset: float = 0.0, start: int = 0,
+    image_frame: ImageFrame | None = None,
+) -> Keypoints:  # fmt: skip
+    """The record of all people of every frame; `places` of the frames are their files and places there, for messages.
+
+    Others as in `read_openpose`, whose errors it raises.
+    """
+    if not any(people) and (source.is_dir() or len(people) != 1):
+        raise _nobody(len(people), camera)
+    first = next((len(persons[0].pose_keypoints_2d) // 3 for persons in people if persons), 0)
+    named = keypoint_set or SET_OF_COUNT.get(first, "BODY_25B")
+    numbers = [_numbers(persons, *place, named) for persons, place in zip(people, places, strict=True)]
+    data = stacked(numbers, len(keypoint_names(named)))
+    record = keypoint_record(data, camera, named, rate, time_offset, start, source, image_frame)
     return in_right_order(record, stated=keypoint_set is not None)
+
+
+def _nobody(frames: int, camera: str) -> ObservationError:
+    problem = f"no person is detected in any of the {frames} frames of camera {camera}"
+    remedy = "Check that the detector ran on this camera's video, or remove this camera."
+    return ObservationError(problem, remedy=remedy)
 
 
 @checked
@@ -164,15 +202,12 @@ def read_mediapipe(
     if keypoint_set == "MEDIAPIPE_478":
         data = face_mesh(data)
     if not data[..., 2].any():
-        raise ObservationError(
-            f"no person is detected in any of the {len(data)} frames of camera {camera}",
-            remedy="Check that the detector ran on this camera's video, or remove this camera.",
-        )
+        raise _nobody(len(data), camera)
     return keypoint_record(data[:, None], camera, keypoint_set, rate, time_offset, start, path, image_frame)
 
 
 _CALISCOPE_HANDS = (100, 200)  # first indices of the right and of the left hand
-_GAPS, _PORTS = 20, 100  # indices for each that is there, and cameras, beyond which a table is damaged
+_PORTS = 100  # cameras, beyond which a table is damaged
 
 
 @checked
@@ -207,19 +242,15 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
     table = table[((table[:, 3] < pose) | right | left) & np.isfinite(table).all(axis=1)]
     if not len(table):
         raise ObservationError("no landmark of the body in this table", remedy="Track the whole pose.")
-    numbers = table[:, (0, 1, 3)]
-    if (wrong := (numbers < 0) | (numbers > 2**31) | (numbers % 1 != 0)).any():
-        row, k = np.argwhere(wrong)[0]
-        problem = f"{('sync_index', 'port', 'point_id')[k]} = {numbers[row, k]:g}"
-        raise ObservationError(problem, remedy="They are whole numbers from 0 on: export the table again.")
-    frame, port, point = numbers.astype(int).T
+    frame, port, point = (
+        frame_numbers(table[:, k], columns[k], from_first=columns[k] == "sync_index") for k in (0, 1, 3)
+    )
     keypoint_set = MEDIAPIPE_SETS[int(point.max() >= pose)]
     for k, begin in enumerate(_CALISCOPE_HANDS):  # the left hand comes first in the set
         point[(point >= begin) & (point < begin + HAND_POINTS)] += pose + (1 - k) * HAND_POINTS - begin
-    frame = frame - frame.min()
-    if frame.max() > _GAPS * len(np.unique(frame)) + 1000 or len(np.unique(port)) > _PORTS:
-        problem = f"{len(np.unique(frame))} frames of {len(np.unique(port))} ports in {frame.max() + 1} of sync_index"
-        raise ObservationError(problem, remedy="Indices follow each other: export the table again.")
+    if len(np.unique(port)) > _PORTS:
+        problem = f"{len(np.unique(port))} ports"
+        raise ObservationError(problem, remedy="A port is a camera: export the table again.")
     if rate is None:
         first = port == port[0]
         _, at = np.unique(frame[first], return_index=True)
@@ -244,26 +275,30 @@ def read_keypoints(
     Parameters
     ----------
     path : path
-    format : "openpose", "mediapipe", "caliscope" or a plug-in's, optional
-        Default: a folder is OpenPose's, a .npy file MediaPipe's, another file of the plug-in that recognises it. Of
-        caliscope the port of the camera's last number.
+    format : "openpose", "alphapose" (and COCO's results), "mmpose", "mediapipe", "freemocap", "caliscope", \
+            "deeplabcut", "sleap", "sports2d" or a plug-in's, optional
+        Default: the one that recognises the folder or file. Of caliscope and FreeMoCap the camera of the last number
+        in the camera's name.
     camera, rate, time_offset, image_frame
         As in `read_openpose` and `read_mediapipe`; caliscope's tables state their rate.
     **options
-        More of `read_openpose` or `read_mediapipe`.
+        keypoint_set : of all but caliscope. Default: by the number of points or by their names; for DeepLabCut, SLEAP
+        and Sports2D any set of the body, whose points then have the names in the file.
+        names : {name in the file: point of the set}, "" to leave a point out: of DeepLabCut, SLEAP and Sports2D.
+        frames : of `read_openpose` and `read_mediapipe`.
 
     Raises
     ------
     ObservationError, FileError
-        An unknown format; and what those raise.
+        An unknown format, a file of another or of none; names of no point; and what those raise.
     PluginError
         A plug-in fails.
     """
     path = Path(path)
-    format = format or KEYPOINTS.name_of(path) or "mediapipe"
-    reader = KEYPOINTS.get(format, ObservationError)
+    format = format or KEYPOINTS.name_of(path)
+    reader = KEYPOINTS.get(format or "mediapipe", ObservationError)
     if reader.plugin is None and path.is_file():
-        keypoint_sets.refuse_other_keypoints(path)
+        refuse_another(path, format)
     record: Keypoints = reader.call(
         "read", path, camera=camera, rate=rate, **options, what=f"Keypoints of the camera '{camera}' at {rate} Hz",
         valid=lambda one: isinstance(one, Keypoints) and one.camera == camera and rate in (None, one.rate),
@@ -276,13 +311,60 @@ def _is_caliscope(path: Path) -> bool:
     return path.suffix.lower() == ".csv" and b"sync_index" in read_bytes(path, 4096)
 
 
+def _is_array(path: Path, dimensions: int, *last: tuple[int, int]) -> bool:
+    """Whether a file is an array of numbers with as many dimensions, of which the last two are one of these."""
+    header = npy_header(path) if path.suffix.lower() == ".npy" else None
+    shape = header[0] if header is not None and header[1].kind in "fiu" else ()
+    return len(shape) == dimensions and shape[-2:] in last
+
+
+def _of_number(cameras: Mapping[str, _Decoded], camera: str) -> _Decoded:
+    """What a file has of the camera that the last number in a name counts."""
+    numbers = re.findall(r"\d+", camera)
+    name = f"cam_{int(numbers[-1][-18:])}" if numbers else ""
+    if name not in cameras:
+        raise ObservationError(choices("camera in this file named", camera, cameras))
+    return cameras[name]
+
+
 @names_file
 def _caliscope_camera(path: Path, *, camera: str, rate: float | None) -> Keypoints:
-    ports, numbers = read_caliscope_csv(path, rate=rate), re.findall(r"\d+", camera)
-    port = ports.get(f"cam_{int(numbers[-1][-18:])}" if numbers else "")
-    if port is None:
-        raise ObservationError(choices("camera in this table named", camera, ports))
-    return replace(port, camera=camera)
+    return replace(_of_number(read_caliscope_csv(path, rate=rate), camera), camera=camera)
+
+
+@names_file
+def _freemocap_camera(path: Path, *, camera: str, rate: float | None, keypoint_set: str | None = None) -> Keypoints:
+    """Pose with the right, then the left hand, and the face mesh: (C, F, K, 3) x, y [px], and a depth, not used.
+
+    NaN where undetected. Without a rate, which the file does not state, at 1 Hz.
+    """
+    data, face = read_npy(path, remedy="Process the videos again."), keypoint_set == FACE_SET
+    pose, left, end = (len(KEYPOINT_SETS["MEDIAPIPE_33"]) + k * HAND_POINTS for k in range(3))
+    if not _is_array(path, 4, *_FREEMOCAP) or (face and data.shape[2] <= end):
+        remedy = "Give FreeMoCap's array of 2D landmarks, (cameras, frames, 33, 75 or 553, 3); with the face 553."
+        raise ObservationError(f"landmarks have shape {data.shape}", remedy=remedy)
+    uv = _of_number({f"cam_{k}": of for k, of in enumerate(data[..., :2])}, camera)
+    uv = uv[:, end:] if face else np.concatenate([uv[:, :pose], uv[:, left:end], uv[:, pose:left]], axis=1)
+    seen = np.isfinite(uv).all(axis=-1, keepdims=True)
+    whole = np.where(seen, np.concatenate([uv, seen], axis=-1), 0.0)[:, None]
+    name = FACE_SET if face else MEDIAPIPE_SETS[int(data.shape[2] > pose)]
+    return keypoint_record(whole, camera, name, rate or 1.0, 0.0, 0, path, None)
+
+
+_OTHER_FILES = {  # what such a file has near its start, after spaces: what it is
+    rb"\{(?=.*\"(?:annotations|categories|file_name)\")": "COCO's annotations of many images",
+    rb"\x89HDF\r\n": "HDF5, of which DeepLabCut's and SLEAP's is read with the package h5py (kinefit[hdf5])",
+}
+_READ = (
+    "Give OpenPose's folder of one json file a frame, or a file of AlphaPose, MMPose, MediaPipe, FreeMoCap (2D), "
+    "Caliscope, DeepLabCut, SLEAP or Sports2D; others by a package (page own-sensor)."
+)
+
+
+def other_keypoints(path: Path) -> str:
+    """What a file of keypoints that are not read is; "" for any other file."""
+    start = read_bytes(path, 4096).lstrip()
+    return next((what for pattern, what in _OTHER_FILES.items() if re.match(pattern, start, re.DOTALL)), "")
 
 
 def _numbered_files(folder: Path) -> list[Path]:
@@ -297,8 +379,8 @@ def _numbered_files(folder: Path) -> list[Path]:
         remedy = "Name the folder that the detector wrote for this camera."
         raise FileError("there are no json files in this folder", remedy=remedy)
     for path in files:
-        if not _FRAME_NUMBER.search(path.name):
-            keypoint_sets.refuse_other_keypoints(path)
+        if not FRAME_NUMBER.search(path.name):
+            refuse_another(path, "openpose")
             raise ObservationError("no frame number in this name", file=path, remedy="Expected NAME_0012.json.")
     numbered = frames_by_name([path.name.lower().replace("_keypoints", "") for path in files], "frames")
     numbered.refuse_gaps("frames")
@@ -309,19 +391,31 @@ def _numbered_files(folder: Path) -> list[Path]:
     return files
 
 
-def _read_people(path: Path) -> list[OpenPosePerson]:
-    """All people of one frame."""
+def decoded(path: Path, decode: Callable[[bytes], _Decoded], format: str) -> _Decoded:
+    """What a json file of a format holds; ObservationError if it is of another one, or broken."""
     raw = read_bytes(path)
     try:
-        return decode_openpose(raw).people
+        return decode(raw)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        keypoint_sets.refuse_other_keypoints(path)
+        refuse_another(path, format)
         infinite = re.search(rb"[\[,:]\s*-?(NaN|Inf)", raw, re.IGNORECASE)
         problem = "NaN or infinity among the keypoints" if infinite else f"broken json ({error})"
         raise ObservationError(problem, file=path, remedy="Run the detector again on this frame.") from error
 
 
-def _numbers(people: list[OpenPosePerson], path: Path, keypoint_set: str) -> NDArray:
+def refuse_another(path: Path, format: str | None) -> None:
+    """Raise ObservationError for a file that is recognised as of another format, or as nothing that is read."""
+    found = KEYPOINTS.name_of(path, [])
+    if found not in (None, format):
+        problem = f"{KEYPOINTS.get(str(found)).summary}, not {format}"
+        raise ObservationError(problem, file=path, remedy=f'Write format = "{found}" in place of "{format}".')
+    strange = format is None and path.suffix.lower() != ".npy"
+    other = "" if found else other_keypoints(path) or "a file of another kind" * strange
+    if other:
+        raise ObservationError(f"{other}: no keypoints of a known form", file=path, remedy=_READ)
+
+
+def _numbers(people: Sequence[OpenPosePerson], path: Path, place: str, keypoint_set: str) -> NDArray:
     """(P, K, 3) x, y [px], confidence of all people of one frame."""
     count = len(keypoint_names(keypoint_set))
     values = [p.with_hands() if keypoint_set == OPENPOSE_HANDS else p.pose_keypoints_2d for p in people]
@@ -333,7 +427,7 @@ def _numbers(people: list[OpenPosePerson], path: Path, keypoint_set: str) -> NDA
                 else f"No set has so many; there are: {', '.join(KEYPOINT_SETS)}. Run the detector with one of these."
             )  # fmt: skip
             problem = f"{len(numbers)} numbers where {keypoint_set} has {count} x 3"
-            raise ObservationError(problem, file=path, place=f"person {i}", remedy=remedy)
+            raise ObservationError(problem, file=path, place=f"{place}person {i}", remedy=remedy)
     data = np.array(values, dtype=float).reshape(len(people), count, 3)
     if not np.isfinite(data).all():
         raise ObservationError("numbers too large", file=path, remedy="Run the detector again on this frame.")
@@ -341,7 +435,14 @@ def _numbers(people: list[OpenPosePerson], path: Path, keypoint_set: str) -> NDA
 
 
 OPENPOSE = FileFormat("OpenPose (Cao et al. 2021, IEEE TPAMI 43:172)", (), read_openpose, Path.is_dir)
-MEDIAPIPE = FileFormat("MediaPipe Pose (Bazarevsky et al. 2020, BlazePose)", (".npy",), read_mediapipe)
+MEDIAPIPE = FileFormat(
+    "MediaPipe Pose (Bazarevsky et al. 2020, BlazePose)", (".npy",), read_mediapipe,
+    lambda path: _is_array(path, 3, (33, 3), (75, 3)),
+)
+FREEMOCAP = FileFormat(
+    "the landmarks in all images of FreeMoCap", (".npy",), _freemocap_camera,
+    lambda path: _is_array(path, 4, *_FREEMOCAP), has_all_cameras=True,
+)
 CALISCOPE = FileFormat(
     "the landmarks that Caliscope recorded", (".csv",), _caliscope_camera, _is_caliscope, has_all_cameras=True
 )

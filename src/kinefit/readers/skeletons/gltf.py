@@ -140,7 +140,8 @@ def _in_one(tree: dict[str, Any], binary: bytes, path: Path) -> Gltf:
     for image in tree.get("images", []):
         if "uri" in image:
             uri = image.pop("uri")
-            image.setdefault("mimeType", _image_type(uri))
+            named = _IMAGES.get(Path(uri).suffix.lower(), "image/png")
+            image.setdefault("mimeType", uri[5:].partition(";")[0] if uri.startswith("data:") else named)
             start, length = place(uri)
             image["bufferView"] = len(tree.setdefault("bufferViews", []))
             tree["bufferViews"].append({"buffer": 0, "byteOffset": start, "byteLength": length})
@@ -157,7 +158,3 @@ def _content(uri: str, path: Path) -> bytes:
         problem = f"it names a file outside of its folder: {uri}"
         raise FileError(problem, remedy="Move that file into the folder, or export the character as GLB.")
     return read_bytes(file)
-
-
-def _image_type(uri: str) -> str:
-    return uri[5:].partition(";")[0] if uri.startswith("data:") else _IMAGES.get(Path(uri).suffix.lower(), "image/png")

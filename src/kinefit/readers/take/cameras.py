@@ -1,4 +1,4 @@
-"""Cameras of a take: as calibrated, and how images relate to that; without calibration level, of a usual lens."""
+"""Cameras of a take: as calibrated, and how images relate to that; without calibration level, with a typical lens."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class TakeCameras:
 
 
 def is_alone(take: Take) -> bool:
-    """Whether a take has one camera, and no calibration; `check_take` lets no sensor of another world beside it."""
+    """Whether a take has one camera, and no calibration; `check_take` admits no sensor of another world."""
     return take.calibration is None and len(take.cameras) == 1
 
 
@@ -150,7 +150,7 @@ def calibrated_size(take: Take, name: str) -> tuple[int, int] | None:
     """(width, height) [px] of a camera's image, for a calibration that does not state it; None if unknown.
 
     It is that of the camera's video, or its `size`, unless the take says that the image is not the calibration's. A
-    camera that the take leaves out has a size that nobody asks for: (1, 1).
+    camera that the take leaves out has the size (1, 1), which is never used.
     """
     if name not in {one.camera or one.name for one in take.depth} | {one.name for one in take.cameras}:
         return 1, 1

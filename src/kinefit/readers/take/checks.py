@@ -65,7 +65,7 @@ def check_take(take: Take) -> None:
 
 
 def _head(take: Take) -> _Odd:
-    """Keys of [take] that have no use beside others."""
+    """Keys of [take] that have no use together with others."""
     if take.frames is not None and not take.frames[0] < take.frames[1]:
         yield f"frames {list(take.frames)}", "[take] frames", "Give [first, one after the last]."
     if take.person is not None:
@@ -217,7 +217,7 @@ def refuse_streams(take: Take) -> None:
 
 
 def odd_streams(take: Take) -> Iterator[tuple[str, str, str]]:
-    """Streams that stand beside what excludes them: problem, place, remedy."""
+    """Streams that are given together with what excludes them: problem, place, remedy."""
     streaming = {camera.name for camera in take.cameras if camera.stream is not None}
     for source in take.keypoints:
         if source.stream is not None and source.camera in streaming:

@@ -19,7 +19,7 @@ _MAX_RATE_DIFFERENCE = 0.01  # rates that differ by less are one
 
 
 def depth_notes(videos: Iterable[DepthVideo | CloudVideo], rate: float) -> Iterator[str]:
-    """What is worth saying of the time of depth beside that of the take [Hz]: other rates, frames that are missing."""
+    """How the times of depth differ from those of the take [Hz]: other rates, frames that are missing."""
     for video in videos:
         if abs(video.rate / rate - 1.0) > _MAX_RATE_DIFFERENCE:
             yield (
@@ -60,7 +60,7 @@ def _clouds(entry: DepthEntry, rig: Rig | None, rate: float | None) -> CloudVide
     assert entry.file is not None
     camera = entry.camera or entry.name
     clouds = read_clouds(
-        entry.file, sensor=entry.name, unit=entry.unit or 1.0, rate=entry.rate, usual_rate=rate,
+        entry.file, sensor=entry.name, unit=entry.unit or 1.0, rate=entry.rate, default_rate=rate,
         range=entry.range or (0.0, np.inf), time_unit=entry.time_unit, time_offset=entry.time_offset,
         T_world_sensor=rig[camera].T_world_camera if rig is not None else None,
     )  # fmt: skip
@@ -74,7 +74,7 @@ def _video(entry: DepthEntry, rate: float | None) -> DepthVideo:
     assert entry.file is not None
     given: dict[str, Any] = {"sensor": entry.name, "unit": entry.unit, "size": entry.size}
     video = read_depth(
-        entry.file, rate=entry.rate, usual_rate=rate, range=entry.range or (0.0, np.inf), time_unit=entry.time_unit,
+        entry.file, rate=entry.rate, default_rate=rate, range=entry.range or (0.0, np.inf), time_unit=entry.time_unit,
         time_offset=entry.time_offset, **given,
     )  # fmt: skip
     if entry.size is not None and tuple(video.size) != tuple(entry.size):

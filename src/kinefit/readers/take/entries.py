@@ -58,6 +58,12 @@ SKIN_SETS = ("HANDS", "WRISTS")
 NO_FILES = ("detect", "skin")
 """Formats of `[[keypoints]]` that are computed from videos, besides those of files."""
 
+COUNTED = ("openpose", "alphapose", "mmpose")
+"""Formats of `[[keypoints]]` whose set the number of points tells, or the user."""
+
+NAMED = ("deeplabcut", "sleap", "sports2d")
+"""Those whose points have names, of a known set or of a set of the body's own."""
+
 RENAMED: dict[str, dict[str, str]] = {
     table: {"accuracy": "sigma"} for table in ("keypoints", "silhouette", "markers", "depth", "stereo")
 }
@@ -137,10 +143,11 @@ class KeypointsEntry(TakeEntry, frozen=True, kw_only=True):
     """`[[keypoints]]`: what a detector saw in one camera."""
 
     camera: str
-    file: Path | None = None  # or folder; default, of "detect" only: what `kinefit detect` leaves beside the take
+    file: Path | None = None  # or folder; default, of "detect" only: what `kinefit detect` leaves next to the take
     stream: Path | None = None  # of `kinefit live`, in place of a file: a folder that OpenPose's JSON files come into
     format: str = "openpose"  # of `KEYPOINTS`, or "detect" or "skin"
-    set: str | None = None  # default: BODY_25B of openpose, MEDIAPIPE_33 of mediapipe, HANDS of skin
+    set: str | None = None  # default: by the number or the names of the points, MEDIAPIPE_33, HANDS of skin
+    names: dict[str, str] | None = None  # {name in the file: point of the set, "" for none}
     frame: Literal["calibration", "video"] | None = None  # image frame of the coordinates; needed where the two differ
     rate: Rate | None = None  # [Hz]; default: the camera's video, or the take
     sigma: Pixels = KEYPOINT_SIGMA  # [px] standard deviation, in the calibration's image
@@ -153,12 +160,13 @@ class KeypointsEntry(TakeEntry, frozen=True, kw_only=True):
         files, own = KEYPOINTS.names(), (*KEYPOINTS.built_in, *NO_FILES)
         self._uses(self.format, {
             "file": (*files, "detect"), "frame": files, "rate": files, "face": ("skin",), "stream": ("openpose",),
-            "excluded": (*files, "detect"), "swapped": (*files, "detect"), "set": own,
+            "excluded": (*files, "detect"), "swapped": (*files, "detect"), "set": own, "names": NAMED,
         })  # fmt: skip
-        sets = {"openpose": tuple(KEYPOINT_SETS), "skin": SKIN_SETS, "detect": (*MEDIAPIPE_SETS, FACE_SET)}
+        of_all, of_face = dict.fromkeys(COUNTED, tuple(KEYPOINT_SETS)), (*MEDIAPIPE_SETS, FACE_SET)
+        sets = {**of_all, "skin": SKIN_SETS, "detect": of_face, "freemocap": of_face}
         known = sets.get(self.format, MEDIAPIPE_SETS)
-        kind = "keypoint set" if self.format == "openpose" else f"keypoint set of {self.format}"
-        odd = self.set is not None and self.set not in known
+        kind = "keypoint set" if self.format in COUNTED else f"keypoint set of {self.format}"
+        odd = self.set is not None and self.set not in known and self.format not in NAMED
         refuse(odd, choices(kind, str(self.set), known), f'Use set = "{known[0]}", or remove it.')
         none = self.file is None and self.stream is None and self.format not in NO_FILES
         refuse(none, f"no file of {self.format} keypoints", 'Write file = "...", or format = "detect".')
@@ -215,7 +223,7 @@ class DepthEntry(TakeEntry, frozen=True, kw_only=True):
     size: tuple[_Side, _Side] | None = None  # [px] (width, height), of raw files
     range: tuple[_Reach, _Reach] | None = None  # [m] (near, far): what is measured outside of it is dropped
     intrinsics: tuple[_Focal, _Focal, float, float] | None = None  # [px] fx, fy, cx, cy, in a take without calibration
-    distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] beside the intrinsics
+    distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] besides the intrinsics
     rate: Rate | None = None  # [Hz]; default: what the file states, the take's, the videos'
     time_unit: _Scale | None = None  # [s] of the last number in every file's name, where that is the time
     time_offset: Seconds = 0.0  # [s] time of the first frame

@@ -71,7 +71,7 @@ class Proposal:
     Parameters
     ----------
     entry : {key: value} of the table; a `Path` is written relative to the take file
-    reason : why, as the comment beside the first key
+    reason : why, as the comment after the first key
     used : False for an entry that is written as a comment
     """
 
@@ -97,7 +97,7 @@ class SensorKind(Extension):
     label : name of the sensor of a single entry, "insole"; of several "insole 2"; default: the table
     finds_pose : whether it shows where the body is, so that it needs no start
     shows_everybody : whether it shows all people in view, and not the tracked person alone
-    replaces_keypoints : whether videos beside it are not searched for keypoints, where the take names none
+    replaces_keypoints : whether videos of the same take are not searched for keypoints, where the take names none
     records : classes, besides its measurements, that a checkpoint has to store
     """
 

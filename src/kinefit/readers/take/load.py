@@ -23,6 +23,7 @@ from kinefit.readers.calibration.read import found_notes
 from kinefit.readers.landmarks.detections import detections_file, read_detections
 from kinefit.readers.landmarks.keypoint_sets import FACE_SET
 from kinefit.readers.landmarks.keypoints import read_keypoints
+from kinefit.readers.landmarks.networks import read_sigma
 from kinefit.readers.markers import read_markers
 from kinefit.readers.plates import PlatesRead, read_force_file
 from kinefit.readers.take import cameras as rigs
@@ -144,13 +145,15 @@ def _load_sensors(cameras: rigs.TakeCameras) -> tuple[TakeSensor, ...]:
 
 
 @checked
-def load_observations(take: entries.Take, *, exteriors: bool = True) -> Observations:
+def load_observations(take: entries.Take, *, exteriors: bool = True, calibrated: bool = True) -> Observations:
     """Read everything that a take names, and check that it fits together.
 
     Parameters
     ----------
     exteriors : bool
         Whether the calibration must state where cameras stand; without, one that it puts nowhere stands at the origin.
+    calibrated : bool
+        Whether confidences of detections are those of their network's calibration, where it has one.
 
     Raises
     ------
@@ -195,7 +198,7 @@ def load_observations(take: entries.Take, *, exteriors: bool = True) -> Observat
     keypoints, markers = [], tuple(_read_markers(entry, entry.file) for entry in take.markers)
     static_markers = tuple(_read_markers(e, e.static) if e.static else None for e in take.markers)
     for number, source in enumerate(take.keypoints):
-        read, times = _read_keypoints(source, of_cameras, number)
+        read, times = _read_keypoints(source, of_cameras, number, calibrated=calibrated)
         stream = f"keypoints {source.camera}" + f" ({source.format})" * (len(take.keypoints) > len(take.cameras))
         if times is not clocks.get(source.camera):
             rates[stream] = read.rate
@@ -294,7 +297,7 @@ def _check_times(
 
 
 def _read_keypoints(
-    source: entries.KeypointsEntry, cameras: rigs.TakeCameras, number: int
+    source: entries.KeypointsEntry, cameras: rigs.TakeCameras, number: int, *, calibrated: bool
 ) -> tuple[observations.Keypoints, NDArray]:
     """Keypoints of a camera, and the times (F,) [s] of their frames from the first on."""
     place = f"[[keypoints]] {number + 1}, camera {source.camera}"
@@ -305,12 +308,16 @@ def _read_keypoints(
         found = read_detections(file)
         frame, face = rigs.stated_frame(image, "video", "keypoints"), source.set == FACE_SET
         seen = found.keypoints(source.camera, image_frame=frame, time_offset=offset, face=face)
+        sigma = read_sigma(Path(found.network)) if calibrated and found.network and not face else None
+        seen = seen if sigma is None else sigma.calibrated(seen, len(found.names))
         return seen, frame_times(len(found), found.rate, clock if found.times is None else found.times)
     with located(take.path, place):
         frame = rigs.stated_frame(image, source.frame, "keypoints")
         rate = rigs.stated_rate(source.rate or rates.get(f"video {source.camera}") or take.rate)
     assert source.file is not None
-    options: dict[str, Any] = {"keypoint_set": source.set} if source.format == "openpose" and source.set else {}
+    takes_set = source.set and source.format in (*entries.COUNTED, *entries.NAMED, "freemocap")
+    options: dict[str, Any] = {"keypoint_set": source.set} if takes_set else {}
+    options |= {"names": source.names} if source.names else {}
     record = read_keypoints(
         source.file, format=source.format, camera=source.camera, rate=rate, image_frame=frame, time_offset=offset,
         **options,

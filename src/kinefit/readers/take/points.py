@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.errors import TakeError, choices
 from kinefit.geometry.camera import ImageFrame
 from kinefit.images.detectors.skin import LANDMARKS, WRISTS, SkinTracker, face_box
-from kinefit.observations import ClickVideo, KeypointVideo
+from kinefit.observations import MEDIAPIPE_33, ClickVideo, KeypointVideo
 from kinefit.readers.landmarks.annotations import read_clicks
 from kinefit.readers.landmarks.detections import detections_file, read_detections
 from kinefit.readers.take.cameras import TakeCameras, stated_rate
@@ -94,6 +94,11 @@ def _detected_face(
             remedy="Write face = [left, top, width, height] of the first image used, or run `kinefit detect`.",
         )
     found = read_detections(file)
+    if found.names != MEDIAPIPE_33:
+        raise TakeError(
+            f"the detector's file has points of {found.keypoint_set or 'the body'}, which do not place the face",
+            file=file, remedy="Write face = [left, top, width, height] of the first image used.",
+        )  # fmt: skip
     frames = [i for i in range(begin, min(end, len(found))) if found.seen[i].any()]
     if not frames:
         raise TakeError("no person is detected", remedy="Write face = [left, top, width, height] of the first one.")

@@ -58,21 +58,18 @@ class BarBundle:
 
 
 def adjust_bar(
-    rig: Rig, x_world: NDArray, uv: NDArray, length: float, *, interiors: bool, sigma: float, scatter: float,
-    rounds: int, iterations: int,
+    rig: Rig, x_world: NDArray, problem: BarProblem, *, interiors: bool, rounds: int, iterations: int
 ) -> tuple[BundleState, CameraPrior, BarProblem]:  # fmt: skip
     """Minimise the cost over cameras and ends, with new variance components in every round; see `bar_bundle`.
 
     Parameters
     ----------
     x_world : (F, 2, 3) [m] ends to start from
-    uv : (F, C, 2, 2) [px] of place, camera, end; NaN if unobserved
-    length : float [m]
+    problem : with initial standard deviations
     interiors : whether intrinsics are free
-    sigma, scatter : float [px], [m] initial standard deviations
     rounds, iterations : at most, and steps in each round
     """
-    prior, problem = _common_cameras(rig, interiors), BarProblem(uv, length, sigma, scatter)
+    prior = _common_cameras(rig, interiors)
     state = BundleState(rig, np.zeros(len(rig)), x_world)
     for _ in range(rounds):
         found = adjust(state, prior, problem, iterations=iterations, damping=1e-4, tolerance=1e-7)

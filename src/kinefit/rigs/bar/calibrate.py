@@ -15,7 +15,7 @@ from kinefit._arguments import checked
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
-from kinefit.rigs.bar.bundle import INTERIOR, BarBundle, adjust_bar, bar_bundle
+from kinefit.rigs.bar.bundle import INTERIOR, BarBundle, BarProblem, adjust_bar, bar_bundle
 from kinefit.rigs.bar.start import MIN_PLACES, first_pairs, inlier_distance, on_floor, place, resect, with_focal
 from kinefit.rigs.bar.targets import BarViews
 from kinefit.rigs.board.extrinsics import coverage, known_camera
@@ -278,10 +278,9 @@ def _adjusted(
         placed = place(rig, uv, length, limit, (0.05, 0.02, 0.01, 0.01)[n] * length)
         used = np.isfinite(placed.x_world).all(axis=(1, 2))
         _check_count(int(used.sum()), len(uv))
-        scatter = (1e-3, 1e-3, 1e-4, 1e-4)[n] * length
         found = adjust_bar(
-            rig, placed.x_world[used], placed.uv[used], length, interiors=not known, sigma=sigma, scatter=scatter,
-            rounds=3 if n < 3 else 8, iterations=20,
+            rig, placed.x_world[used], BarProblem(placed.uv[used], length, sigma, (1e-3, 1e-3, 1e-4, 1e-4)[n] * length),
+            interiors=not known, rounds=3 if n < 3 else 8, iterations=20,
         )  # fmt: skip
         rig, sigma = found[0].rig, found[2].sigma
     return bar_bundle(*found), placed.uv[used], used, placed.ambiguous
@@ -302,8 +301,8 @@ def _grown(rig: Rig, uv: NDArray, length: float, known: bool) -> tuple[Rig, floa
             return rig, np.inf, np.zeros(len(rig))
         fits = np.isfinite(placed.uv).all(axis=(2, 3))
         found = adjust_bar(
-            rig, placed.x_world[used], placed.uv[used], length, interiors=not known, sigma=sigma,
-            scatter=5e-3 * length, rounds=2, iterations=15,
+            rig, placed.x_world[used], BarProblem(placed.uv[used], length, sigma, 5e-3 * length),
+            interiors=not known, rounds=2, iterations=15,
         )  # fmt: skip
         rig, sigma = found[0].rig, found[2].sigma
     return rig, sigma, fits.sum(axis=0) / np.maximum(shared.sum(axis=0), 1)

@@ -5,7 +5,7 @@ Calibrate the intrinsics of one camera from views of a board (Z. Zhang, PAMI 200
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations, product
 
@@ -111,12 +111,15 @@ def _turned(board: Board) -> list[NDArray]:
 
 def _view_error(T_camera_board: NDArray, poses: Poses, board: Board) -> float:
     """Median distance of a view's corners from their projections at a pose of the board, in normalised coordinates."""
-    best = np.inf
+    return min(_symmetry_errors(T_camera_board, poses, board))
+
+
+def _symmetry_errors(T_camera_board: NDArray, poses: Poses, board: Board) -> Iterator[float]:
+    """The same of each symmetry of the board; infinite with corners behind the camera."""
     for order in board.symmetries:
         x = board.corners[order[poses.view.ids]] @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
-        if x[:, 2].min() > 0:
-            best = min(best, float(np.median(np.linalg.norm(x[:, :2] / x[:, 2:] - poses.xy, axis=1))))
-    return best
+        error = np.median(np.linalg.norm(x[:, :2] / x[:, 2:] - poses.xy, axis=1))
+        yield float(error) if x[:, 2].min() > 0 else np.inf
 
 
 def _vote(camera: Camera, pairs: list[tuple[Poses, Poses]], board: Board) -> tuple[NDArray, int]:
@@ -219,11 +222,8 @@ def _place_boards(
 
 def _named(T_camera_board: NDArray, poses: Poses, board: Board) -> tuple[NDArray, NDArray]:
     """Corners of a view in the board's frame, in the order of the pose, and their pixels."""
-    errors = []
-    for order in board.symmetries:
-        x = board.corners[order[poses.view.ids]] @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
-        errors.append(np.median(np.linalg.norm(x[:, :2] / x[:, 2:] - poses.xy, axis=1)))
-    return board.corners[board.symmetries[int(np.argmin(errors))][poses.view.ids]], poses.view.uv
+    nearest = int(np.argmin([*_symmetry_errors(T_camera_board, poses, board)]))
+    return board.corners[board.symmetries[nearest][poses.view.ids]], poses.view.uv
 
 
 MIN_VIEWS = 4  # three determine focal length and centre; one more allows a check

@@ -31,7 +31,7 @@ _MAX_PAIR_FRAMES = 400  # of the first camera, for the cost of a shift
 _MIN_SINE = 0.15  # of the angle between ray and baseline: below, the ray is not informative
 _WINDOW_S = 1.5  # of one estimate: a gesture
 _MIN_WINDOWS, _MAX_WINDOWS = 4, 12
-_SEARCH_S = 12.0  # of the part that is looked at beside the whole: another rate leaves the searched shifts later
+_SEARCH_S = 12.0  # of the part that is looked at besides the whole: another rate leaves the searched shifts later
 _MIN_STEP = 2.0  # [frames] that a clock has to jump or drift by: less is a constant, within a detector's errors
 _MIN_EXCESS = 1.08
 """Cost with constant offsets to that with an offset of its own in each window: up to 1.04 where they are constant."""

@@ -216,7 +216,7 @@ def _soles(x: NDArray, rest_height: NDArray) -> tuple[NDArray, NDArray]:
 
 _MIN_CONFIDENCE = 0.3  # confidence of a keypoint that takes part in the start
 _MAX_POINTS = 2500  # points in space of the start
-_MAX_OTHER_POINTS = 1000  # of more people, beside the one whose body is fitted
+_MAX_OTHER_POINTS = 1000  # of further people, besides the one whose body is fitted
 _FLAT_POSE_SIGMAS = 20.0, 3.0  # [m], [rad] no prior to speak of
 GUESSED_FOCAL_SIGMA = 0.25  # of a focal length's logarithm: 64 degrees stand for 52 to 78 (one standard deviation)
 STATED_FOCAL_SIGMA = 0.1  # the same, of a stated one: the crop of videos differs by as much
@@ -247,7 +247,7 @@ def calibrate_people(
     Where a network lifted people to space in each camera, these skeletons are laid on each other: turns, clocks and
     distances come from them (`first_cameras`). Else essential matrices choose the pair to start from, and the other
     cameras are laid on its points (`first_rig`). Free points, then the body of one person with its constant bone
-    lengths beside the free points of the others, are adjusted together with all cameras.
+    lengths and the free points of the others are adjusted together with all cameras.
 
     Parameters
     ----------
@@ -284,7 +284,7 @@ def calibrate_people(
         alone = [steady_person(record) for record in keypoints]
     keypoints = [in_step(record, n, frames) for record, n in zip(keypoints, late, strict=True)]
     seen = [_common(body, given, one, late, frames, sigma) for one in (alone, *others)]
-    (points, uv), *beside = seen
+    (points, uv), *further = seen
     rig = first or first_rig(given, uv.reshape(-1, len(given), 2), sigma)
     step("first cameras", 1, 2)
     spread = np.broadcast_to(GUESSED_FOCAL_SIGMA if focal is True else focal, len(given)).astype(float)
@@ -301,7 +301,7 @@ def calibrate_people(
         return _on_the_floor(rig, seen, body, height, known_length, up)
 
     trial = PersonTrial(keypoints, body, up, sigma)
-    free = free_points(rig, [u for _, u in beside], sigma)
+    free = free_points(rig, [u for _, u in further], sigma)
     found = refine_from(rig, trial, prior, stand, free=free, progress=progress, from_scratch=True)
     offsets = {name: found.time_offsets[name] + float(n) / rate for name, n in zip(rig.names, late, strict=True)}
     clocks = {name: replace(found.cameras[name], time=offsets[name]) for name in rig.names}

@@ -97,7 +97,7 @@ def first_cameras(cameras: Sequence[Camera], keypoints: Sequence[Keypoints], *, 
     Raises
     ------
     CalibrationError
-        A camera that saw nobody, the same video twice, cameras that never show the same person.
+        A camera in which no person is detected, the same video twice, cameras that never show the same person.
     """
     seen = [skeletons_of(c, k) for c, k in zip(cameras, keypoints, strict=True)]
     _refuse_doubles(seen)
@@ -339,7 +339,7 @@ def steady_person(record: Keypoints) -> Keypoints:
     Raises
     ------
     CalibrationError
-        Nobody is seen in any frame.
+        No person is detected in any frame.
     """
     return record.of_one(steadiest(record))
 

@@ -265,7 +265,7 @@ def _silhouettes(entry: SilhouetteEntry, cameras: TakeCameras) -> SilhouetteVide
         file = entry.file or detections_file(take.path, name)
         found = read_detections(file)
         if found.seen.any() and not len(found.mask_runs):
-            remedy = "Run `kinefit detect` on this take: it stores silhouettes."
+            remedy = "Run `kinefit detect` on this take: the built-in detector stores silhouettes."
             raise TakeError("the detector's file has no silhouettes", file=file, remedy=remedy)
         times = offset + frame_times(len(found), found.rate, clock if found.times is None else found.times)
         image = lambda i: in_calibration(_everybody(found, i), size, frame)

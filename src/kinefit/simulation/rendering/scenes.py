@@ -51,7 +51,7 @@ def room(motion: Motion, camera: Camera) -> Room:
     Parameters
     ----------
     motion : Motion
-        Its lowest landmark is on the floor; the table is beside the volume of the motion.
+        Its lowest landmark is on the floor; the table is outside the volume of the motion.
     camera : Camera in the motion's world
     """
     up = np.array(UP_AXES[motion.up])

@@ -17,7 +17,7 @@ from kinefit.bodies import BodyState
 from kinefit.geometry.camera import Rig
 from kinefit.solving.bundle.arrow import Arrow
 from kinefit.solving.bundle.cameras import CameraPrior
-from kinefit.solving.least_squares import descend
+from kinefit.solving.least_squares import Damping, descend
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,5 +120,5 @@ def adjust(
 
     return descend(
         at(start), lambda now, damping: now.posterior.relative_step(damping), follow, iterations=iterations,
-        tolerance=tolerance, damping=damping,
+        tolerance=tolerance, damping=Damping(damping),
     ).at  # fmt: skip

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
-from kinefit.solving import _kernels_linear
 from kinefit.solving.bundle import border_frames
 from kinefit.solving.bundle.arrow import Arrow, Blocks
 from kinefit.solving.equations import lock
-from kinefit.solving.least_squares import MAX_DAMPING, bounds_of, descend
+from kinefit.solving.least_squares import Damping, bounds_of, descend
 
 _INITIAL_DAMPING = 1e-3  # as a share of the poses' mean diagonal
 _PARAMETER_DAMPING_RATIO = 0.01  # to the poses' damping: parameters have a prior, few angles have one
@@ -106,7 +105,7 @@ def solve(
     mean = float(np.mean([np.trace(f.H) / len(f.H) for f in start.frames])) if start.frames else 1.0
     end = descend(
         start, _Point.step, _Point.follow, iterations=iterations[0], tolerance=tolerance,
-        damping=_INITIAL_DAMPING * mean, least=_kernels_linear.LEAST_DAMPING * mean, most=MAX_DAMPING * mean,
+        damping=Damping(_INITIAL_DAMPING).times(mean),
     )  # fmt: skip
     at = end.at
     return Bordered(at.theta, tuple(at.states), prior, at.cost, end.iterations, end.converged, at.information)

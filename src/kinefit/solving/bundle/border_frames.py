@@ -16,7 +16,7 @@ from kinefit.geometry.losses import SQUARED, Loss
 from kinefit.solving import _kernels_border, _kernels_linear
 from kinefit.solving.bundle.arrow import MIN_DIAGONAL_RATIO
 from kinefit.solving.equations import columns, dense_pattern, lock, normal_equations, residuals, robust_factors
-from kinefit.solving.least_squares import bounds_of, descend
+from kinefit.solving.least_squares import Damping, bounds_of, descend
 from kinefit.solving.pixels import fit_pixels
 from kinefit.solving.rows import AnyRows, DofRows, Rows
 
@@ -198,8 +198,7 @@ def settle(
 
         frame = descend(
             frame, FrameEquations.step, follow, iterations=steps, tolerance=1e-3 * _MIN_COST_FALL,
-            nothing=_MIN_COST_FALL, damping=_INITIAL_DAMPING * mean, least=_kernels_linear.LEAST_DAMPING * mean,
-            most=np.inf,
+            nothing=_MIN_COST_FALL, damping=Damping(_INITIAL_DAMPING, most=np.inf).times(mean),
         ).at  # fmt: skip
         frames.append(frame)
         out.append(frame.state)

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, KinematicTree
 from kinefit.errors import ObservationError
-from kinefit.solving._kernels_linear import LEAST_DAMPING
 from kinefit.solving.equations import dense_pattern, inverse
-from kinefit.solving.least_squares import descend
+from kinefit.solving.least_squares import Damping, descend
 from kinefit.solving.trajectory import _kernels_band, _kernels_smoothing
 from kinefit.solving.trajectory.motion_prior import MotionPrior
 
@@ -282,7 +281,7 @@ def smooth(
         raise ObservationError("this take cannot be smoothed", remedy="Check that all weights and pixels are finite.")
     end = descend(
         start, solve, follow, iterations=max_iterations, tolerance=tolerance, nothing=1e-16 * start.cost + 1e-300,
-        damping=1e-9 * mean, least=LEAST_DAMPING * mean, most=_MAX_DAMPING * mean, last=True,
+        damping=Damping(1e-9, most=_MAX_DAMPING).times(mean), last=True,
     )  # fmt: skip
     return replace(end.at, iterations=end.iterations, converged=end.converged)
 

@@ -142,12 +142,12 @@ class JobQueue:
     Attributes
     ----------
     jobs : of the queue
-    beside : live sessions, which run at the same time as the queue until they are ended
+    sessions : live, which run at the same time as the queue until they are ended
     """
 
     def __init__(self) -> None:
         self.jobs: list[Job] = []
-        self.beside: list[Job] = []
+        self.sessions: list[Job] = []
         self._task: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -163,10 +163,10 @@ class JobQueue:
             self._task = asyncio.create_task(self._work())
         return job
 
-    def start_beside(self, take: Path, command: Sequence[str], environment: Mapping[str, str]) -> Job:
+    def start_session(self, take: Path, command: Sequence[str], environment: Mapping[str, str]) -> Job:
         """Run a command immediately, outside of the queue."""
         job = Job(take, tuple(command), environment=dict(environment))
-        self.beside = [*(old for old in self.beside if old.is_open), job]
+        self.sessions = [*(old for old in self.sessions if old.is_open), job]
         task = asyncio.create_task(_run(job))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -186,7 +186,7 @@ class JobQueue:
 
     async def close(self) -> None:
         """Pause all jobs and wait until what is done is written."""
-        for job in (*self.jobs, *self.beside):
+        for job in (*self.jobs, *self.sessions):
             if job.is_open:
                 job.pause()
         if tasks := [*self._tasks, *([self._task] if self._task else [])]:

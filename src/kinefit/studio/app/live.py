@@ -61,12 +61,12 @@ def found_cameras(root: Path) -> list[Path]:
 
 
 def start_live(jobs: JobQueue, take: Path) -> Job:
-    """Follow a take live in a folder of its own, beside the queue."""
+    """Follow a take live in a folder of its own, at the same time as the queue."""
     out = take.with_name(f"{take.stem}-live-{time.strftime('%Y%m%d-%H%M%S')}")
     with socket.create_server((_HOST, 0)) as server:
         port = server.getsockname()[1]
     command = ("live", str(take), "--out", str(out), "--port", str(port))
-    return jobs.start_beside(take, command, {TOKEN_VARIABLE: secrets.token_urlsafe(18)})
+    return jobs.start_session(take, command, {TOKEN_VARIABLE: secrets.token_urlsafe(18)})
 
 
 def page_of(job: Job) -> str:

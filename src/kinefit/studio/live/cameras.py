@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from kinefit.errors import FileError, KinefitError, ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.images.detectors.box_detector import Models
-from kinefit.images.detectors.detection import Follower, PersonDetection
+from kinefit.images.detectors.following import Follower, PersonDetection
 from kinefit.observations import MEDIAPIPE_33, Keypoints
 from kinefit.observations.detections import in_calibration
 from kinefit.readers.videos.video import Video

@@ -169,12 +169,8 @@ def guard(access: Access, respond: Respond) -> Respond:
 def connection_log() -> logging.Logger:
     """A logger for websockets that says nothing of port probes, TLS hellos and broken handshakes."""
     log = logging.getLogger("kinefit.studio.serving")
-    log.addFilter(_is_of_handler)
+    log.addFilter(lambda record: record.msg != "opening handshake failed")
     return log
-
-
-def _is_of_handler(record: logging.LogRecord) -> bool:
-    return record.msg != "opening handshake failed"
 
 
 def listen(host: str, port: int, *, search: bool = False) -> socket.socket:

@@ -1,4 +1,4 @@
-"""The player: buttons, sliders and read-outs beside the scene, and the loop that follows them."""
+"""The player: buttons, sliders and read-outs next to the scene, and the loop that follows them."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ class ViewerContent:
     Parameters
     ----------
     motions : tuple of Motion
-        The first one leads the time; the others are shown beside it in other colours, by time.
+        The first one leads the time; the others are shown next to it in other colours, by time.
     rig : Rig, optional
     pictures : CameraImages, optional
     markers : tuple of Markers

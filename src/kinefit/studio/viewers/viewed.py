@@ -40,7 +40,7 @@ def gather(
     Parameters
     ----------
     sources : motion files, folders of results, or one take file
-    take_file : whose cameras and markers are shown; default: the take beside the first folder of results
+    take_file : whose cameras and markers are shown; default: the take next to the first folder of results
     hide_faces : whether all faces are hidden in the cameras' images; a take may say so, too
 
     Raises

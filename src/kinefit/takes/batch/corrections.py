@@ -1,6 +1,6 @@
 """Corrections of a tracked take by its user: edits of the take file that can be undone.
 
-Each edit keeps the text before it in the folder TAKE-before beside the take, and the clicks where it changes these. A
+Each edit keeps the text before it in the folder TAKE-before next to the take, and the clicks where it changes these. A
 take file that would not be valid is not written.
 
 What a motion was computed from, and whether that was changed since.
@@ -38,7 +38,7 @@ from kinefit.takes.preparing.take import has_face, uses_detector
 TakePath = str | PathLike[str]
 Range = tuple[int, int]
 CLICKS = "clicks.json"
-"""File beside the take that new clicks are written to; with the take's name before it where another take has it."""
+"""File next to the take that new clicks are written to; with the take's name before it where another take has it."""
 _CLICK_SIGMA = "1.0"  # [px] well below the noise of any detector, so that the joint goes where it was placed
 
 

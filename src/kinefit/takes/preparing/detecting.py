@@ -11,18 +11,21 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from glob import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from kinefit._files import regular
 from kinefit._threads import cores
 from kinefit.errors import AssetError, FileError, TakeError
+from kinefit.observations.detections import WITH_HANDS
 from kinefit.takes.preparing.each_video import Step, Tell, each_video, video_key
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from kinefit.images.detectors.box_detector import Models
+    from kinefit.images.detectors.networks import TopDownModels
     from kinefit.readers.take.entries import CameraEntry
     from kinefit.readers.take.file import Take
     from kinefit.readers.videos.video import Video
@@ -30,12 +33,14 @@ if TYPE_CHECKING:
 PEOPLE = 3
 """How many people are followed at most in one camera, by default."""
 
-QUALITIES = {"balanced": "pose_landmark_full.tflite", "best": "pose_landmark_heavy.tflite"}
-"""Landmark networks: the larger, the nearer to the joints, and the slower."""
+_LARGE = "pose_landmark_heavy.tflite"
+QUALITIES = {"balanced": "pose_landmark_full.tflite", "auto": _LARGE, "best": _LARGE}
+"""Landmark networks: the larger, the nearer to the joints, and the slower. "auto" does not look at every image."""
 
 QUALITY = "best"
 """Of new detections, where none is asked for."""
 
+_MAX_STEP_ERROR = 0.02  # [frames] between images that two cameras take together
 _METHOD = "3"  # raise it when the detector gives other numbers for the same video
 
 
@@ -52,6 +57,8 @@ class DetectionJob:
     rate : float [Hz], optional
         Of a video that is a folder of images.
     seconds : (start, stop) [s] of the video that are looked through; default: all of it
+    time_offset : float [s], when its first image is taken on the clock of all cameras; None where that is unknown
+    looks : images, from the first one looked through, that are looked at for certain; default: by the quality
     """
 
     camera: str
@@ -59,6 +66,8 @@ class DetectionJob:
     file: Path
     rate: float | None = None
     seconds: tuple[float, float] | None = None
+    time_offset: float | None = 0.0
+    looks: range | None = None
 
 
 @dataclass(frozen=True)
@@ -73,6 +82,8 @@ class DetectionSettings:
         Whether these are detected too; default: no.
     quality : str or Path
         One of `QUALITIES`, or the file of a landmark network of one's own; default: `QUALITY`.
+    detector : Path
+        File of a detector of people of one's own; default: the built-in one.
     """
 
     people: int | None = None
@@ -80,6 +91,7 @@ class DetectionSettings:
     hands: bool | None = None
     face: bool | None = None
     quality: str | Path | None = None
+    detector: Path | None = None
 
 
 DEFAULT_SETTINGS = DetectionSettings()
@@ -92,29 +104,65 @@ class Networks:
     Parameters
     ----------
     folder : Path
-        Of the network that finds people.
+        Of the built-in networks, where any is used.
     landmarks : Path
         The network that sees their landmarks.
     name : str
         Of its quality, or what tells a file of one's own from others.
     mirrored : bool
         Whether each crop is looked at a second time, mirrored.
+    detector : Path, optional
+        A network of one's own that finds people.
     """
 
     folder: Path
     landmarks: Path
     name: str
     mirrored: bool = False
+    detector: Path | None = None
+
+    @property
+    def is_own(self) -> bool:
+        """Whether the landmarks are those of a file of one's own, whatever its kind."""
+        return self.name not in QUALITIES
+
+    def models(self, threads: int = 1) -> Models | TopDownModels:
+        """The networks, loaded; not to be shared between threads.
+
+        Raises
+        ------
+        ObservationError
+            The extra `detect`, or `onnx`, is not installed.
+        FileError, PluginError
+            A network that cannot be used.
+        """
+        from kinefit.images.detectors import box_detector, networks
+        from kinefit.readers.landmarks.networks import is_blazepose, open_people, open_points
+
+        if self.is_own and not is_blazepose(self.landmarks):
+            points, layout = open_points(self.landmarks, threads)
+            people: Any
+            if self.detector:
+                people = open_people(self.detector, threads, layout.size[1] / layout.size[0])
+            else:
+                file = self.folder / box_detector.DETECTOR
+                people = box_detector.PersonDetector(box_detector.interpreter(file, threads))
+            return networks.TopDownModels(points, layout, people, mirrored=self.mirrored)
+        more = {"people": open_people(self.detector, threads)} if self.detector else {}
+        return box_detector.Models(self.folder, threads, self.landmarks, mirrored=self.mirrored, **more)
 
 
 def jobs_of_take(take: Take) -> list[DetectionJob]:
     """Every camera of a take that has a video; TakeError where none has."""
     from kinefit.readers.landmarks.detections import detections_file
+    from kinefit.readers.take.cameras import is_uncalibrated
 
-    rate = _rate(take) if take.frames else 0.0
+    rate, clocks_unknown = _rate(take) if take.frames else 0.0, is_uncalibrated(take)
     found = [
-        DetectionJob(c.name, c.video, detections_file(take.path, c.name), take.rate, _seconds(take, c, rate))
-        for c in take.cameras if c.video is not None
+        DetectionJob(
+            c.name, c.video, detections_file(take.path, c.name), take.rate, _seconds(take, c, rate),
+            None if clocks_unknown else c.time_offset,
+        ) for c in take.cameras if c.video is not None
     ]  # fmt: skip
     if not found:
         raise TakeError(
@@ -151,33 +199,57 @@ def detect(
 
     Every file is written as soon as its video is done, so that what was interrupted goes on with the others.
     """
-    from kinefit.images.detectors.box_detector import Models
     from kinefit.readers.landmarks.detections import detections_key
 
     keys = {job: detection_key(job) for job in jobs}
+    if settings.quality is None:  # what is done anew is done as before
+        stored = (detections_key(job.file, "network") for job in jobs)
+        before = next((Path(file) for file in stored if file and Path(file).is_file()), None)
+    else:
+        before = None
     wanted = {**asdict(settings), "quality": settings.quality and _name_of(settings.quality)}
+    wanted["detector"] = settings.detector and _name_of(settings.detector)
     if not force:
         for job in jobs:
             _from_beside(job, keys[job], wanted)
     todo = [job for job in jobs if force or not _fits(detections_key(job.file), keys[job], wanted, job.seconds)]
     if not todo:
         return []
-    files = networks(progress, tell, settings.quality or QUALITY)
-    if files.name == "best" and len(jobs) == 1:  # depths of one camera gain by it; several give the same motion
+    files = _alone(settings, before) or networks(progress, tell, settings.quality or before or QUALITY)
+    files = replace(files, detector=settings.detector)
+    if files.name != "balanced" and len(jobs) == 1:  # depths of one camera gain by it; several give the same motion
         files = replace(files, mirrored=True)
     s = settings
     full = DetectionSettings(PEOPLE if s.people is None else s.people, bool(s.masks), bool(s.hands), bool(s.face))
     threads = max(cores() // len(todo), 1)  # cameras run side by side; what cores are left help them
+    looks = _looks(jobs) if files.name == "auto" else {}
 
     def work(job: DetectionJob, step: Step) -> None:
         key = f"{keys[job]} {_settings(full, job.seconds)}"
         key += f"{' mirrored=True' * files.mirrored} quality={files.name}"
-        _look_through(job, files, full, key, step, threads)
+        key += f" detector={wanted['detector']}" if files.detector else ""
+        _look_through(replace(job, looks=looks.get(job)), files, full, key, step, threads)
 
     with hushed():
-        Models(files.folder, landmarks=files.landmarks)
+        models = files.models()
+    if files.is_own:
+        has_hands = models.layout.keypoint_set in WITH_HANDS
+        missing = ["masks"] if full.masks and not models.layout.has_masks else []
+        missing += ["hands"] if full.hands and not has_hands else []
+        for what in missing:
+            tell(f"No {what} are added to the points of {files.landmarks.name}.")
     each_video(todo, work, progress, of=len(jobs))
     return todo
+
+
+def _alone(settings: DetectionSettings, before: Path | None) -> Networks | None:
+    """Networks of one's own with which no built-in one is used, nor fetched; None for others."""
+    from kinefit.readers.landmarks.networks import is_blazepose
+
+    own = settings.quality or before
+    if not settings.detector or settings.hands or settings.face or not isinstance(own, Path) or is_blazepose(own):
+        return None
+    return Networks(own.parent, own, _name_of(own))
 
 
 def _from_beside(job: DetectionJob, key: str, wanted: Mapping[str, object]) -> None:
@@ -202,16 +274,36 @@ def seconds_of(job: DetectionJob, video: Video) -> tuple[int, int]:
     return first, stop
 
 
+def _looks(jobs: Sequence[DetectionJob]) -> dict[DetectionJob, range]:
+    """Images of each video, from the first one looked through, that are looked at for certain: of all cameras at once.
+
+    Empty, so that all are looked at, where the cameras do not take their images together, or that is not known.
+    """
+    from kinefit.images.detectors.looking import LOOK_RATE
+    from kinefit.readers.videos.video import Video
+
+    rates, firsts = [], []
+    for job in jobs:
+        with Video(job.video, rate=job.rate) as video:
+            ahead = np.nan if job.time_offset is None or video.unevenness else job.time_offset * video.rate
+            rates.append(video.rate)
+            firsts.append(ahead + seconds_of(job, video)[0])  # on the common clock, in steps
+    step, off = max(round(rates[0] / LOOK_RATE), 1), np.subtract(firsts, np.rint(firsts))
+    if step == 1 or not (np.allclose(rates, rates[0], rtol=1e-3) and np.all(np.abs(off) < _MAX_STEP_ERROR)):
+        return {}
+    return {job: range(-round(first) % step, sys.maxsize, step) for job, first in zip(jobs, firsts)}
+
+
 def _look_through(
     job: DetectionJob, files: Networks, settings: DetectionSettings, key: str, tell: Step, threads: int
 ) -> None:
     from kinefit.exporters.motion_file import write_detections
-    from kinefit.images.detectors.box_detector import Models
     from kinefit.images.detectors.detection import detect_people
     from kinefit.images.detectors.faces import FaceFinder, FaceModels, HandFollower, HandModels
     from kinefit.readers.videos.video import Video
 
-    models = Models(files.folder, threads, files.landmarks, mirrored=files.mirrored)
+    models, folder = files.models(threads), files.folder
+    hands = settings.hands and models.layout.keypoint_set in WITH_HANDS
     with Video(job.video, rate=job.rate) as video:
         first, last = seconds_of(job, video)
 
@@ -224,11 +316,14 @@ def _look_through(
         found = detect_people(
             counted(video.frames(first, last)), models, camera=job.camera, rate=video.rate,
             people=settings.people or 0, masks=bool(settings.masks),
-            with_hands=HandFollower(HandModels(files.folder, threads)) if settings.hands else None,
-            with_faces=FaceFinder(FaceModels(files.folder, threads)) if settings.face else None,
+            with_hands=HandFollower(HandModels(folder, threads), layout=models.layout) if hands else None,
+            with_faces=FaceFinder(FaceModels(folder, threads), models.layout) if settings.face else None,
+            looks=job.looks,
         )  # fmt: skip
         times = video.times if video.unevenness else None
         found = replace(found.within(first, len(video)), times=times, source=str(job.video))
+        if files.is_own:
+            found = replace(found, network=str(files.landmarks.absolute()))
     write_detections(found, job.file, key=key)
 
 
@@ -264,13 +359,19 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
 
 
 def _name_of(quality: str | Path) -> str:
-    """Name that distinguishes results by quality, or by the network's file."""
+    """Name that distinguishes results by quality, or by the network's file and the one that describes it."""
+    from kinefit.readers.landmarks.networks import description_file
+
     if isinstance(quality, str):
         return quality
     try:
-        return hashlib.sha256(regular(quality).read_bytes()).hexdigest()[:16]
+        with regular(quality).open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256")
+        if (stated := description_file(quality)).is_file():
+            digest.update(stated.read_bytes())
     except OSError as error:
-        raise FileError(f"cannot be read ({error.strerror})", file=quality, remedy="Check --network.") from error
+        raise FileError(f"cannot be read ({error.strerror})", file=quality, remedy="Check its path.") from error
+    return digest.hexdigest()[:16]
 
 
 def detection_key(job: DetectionJob) -> str:

@@ -7,7 +7,6 @@ those of the search for small ones; `key`, which another video does not have.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
 _METHOD = "faces 1"  # raise it when other circles are found in the same video
 _STEP, _SMALL_STEP = 0.1, 0.4  # [s] between frames that are searched; for small heads, which move by few pixels
 _MAX_MOVE, _MAX_RATIO = 2.5, 1.6  # [radii] of a head between two frames that are searched, and of its radii then
-_HEAD_POINTS = re.compile(r"nose|eye|(^|_)ear|mouth|head")
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,11 +117,12 @@ def shown_video(take: Take, seen: Observations, camera: str, *, find: bool = Tru
 
     def of_keypoints(frame: int) -> NDArray:
         from kinefit.images.detectors.faces import head_circles
+        from kinefit.images.detectors.layouts import HEAD_POINTS
 
         circles = [np.zeros((0, 3))]
         for keypoints in seen.keypoints:
             if keypoints.camera == camera:
-                named = [k for k, name in enumerate(keypoints.names) if _HEAD_POINTS.search(name.lower())]
+                named = [k for k, name in enumerate(keypoints.names) if HEAD_POINTS.search(name.lower())]
                 at = round((video.times[frame] + offset - keypoints.time_offset) * keypoints.rate)
                 near = keypoints.points[max(at - 1, 0) : max(at + 2, 0), :, named]
                 uv = seen.images[camera].from_calibration(near)

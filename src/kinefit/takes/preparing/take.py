@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import load_body
 from kinefit.errors import ObservationError, TakeError
+from kinefit.observations import Detections
 from kinefit.readers.landmarks.detections import detections_file, read_detections
 from kinefit.readers.landmarks.keypoint_sets import FACE_SET
 from kinefit.readers.take.entries import KeypointsEntry
@@ -160,10 +161,12 @@ def hide_in_copies(path: Path, progress: Step | None, tell: Tell) -> list[Path]:
         key = detections_key(job.file)
         found = read_detections(job.file) if key is not None else None
 
-        def of_people(frame: int, points: NDArray | None = None if found is None else found.points) -> NDArray:
+        def of_people(frame: int, found: Detections | None = found) -> NDArray:
             from kinefit.images.detectors.faces import head_circles
+            from kinefit.images.detectors.layouts import HEAD_POINTS
 
-            return np.zeros((0, 3)) if points is None else head_circles(points[frame, :, :11])
+            named = [k for k, name in enumerate(found.names if found else ()) if HEAD_POINTS.search(name.lower())]
+            return head_circles(found.points[frame][:, named]) if found and named else np.zeros((0, 3))
 
         def shown(video: Video, camera: str = job.camera) -> Iterator[NDArray[np.uint8]]:
             for frame, image in enumerate(video.frames()):

@@ -140,7 +140,8 @@ def tube(limbs: Sequence[PosedLimb], around: int, closed: tuple[bool, bool]) -> 
     at = np.linspace(0.0, way[-1], count) if way[-1] > 0 else np.zeros(1)
     centre, rays, axes = sections(at)
     x = _exits(centre.repeat(around, axis=0), rays.reshape(-1, 3), reach, limbs)[:, None] * rays.reshape(-1, 3)
-    vertices, segment = [centre.repeat(around, axis=0) + x], [_owners(at, balls, owner).repeat(around)]
+    vertices = [centre.repeat(around, axis=0) + x]
+    segment = [owner[np.argmin(np.abs(at[:, None] - balls), axis=1)].repeat(around)]  # of the nearest balls
     rings = np.arange(len(at) * around).reshape(len(at), around)
     caps, first = list[NDArray | None](), rings.size
     for end, wanted in enumerate(closed):
@@ -167,11 +168,6 @@ def _smooth(way: NDArray, middles: NDArray, wide: float) -> tuple[NDArray, NDArr
     weight = np.hanning(2 * half + 3)[1:-1]
     longer = np.concatenate([before, line, after])
     return at, np.stack([np.convolve(longer[:, k], weight / weight.sum(), "valid") for k in range(3)], axis=1)
-
-
-def _owners(at: NDArray, way: NDArray, owner: NDArray) -> NDArray:
-    """Segments (R,) of positions along a tube: those of the nearest balls."""
-    return np.asarray(owner[np.argmin(np.abs(at[:, None] - way), axis=1)])
 
 
 def _cap(ring: NDArray, first: int) -> tuple[NDArray, NDArray]:

@@ -50,7 +50,8 @@ def grow_between(
         if out is None and len(seeds.first) < _MIN_SEEDS:
             seeds = sift_seeds(first, second, cameras)
             return _reject_inconsistent(grid, grow(first, second, grid, seeds, window=window, least=least))
-        more = _reject_inconsistent(grid, grow(first, second, _unmatched(grid, out), seeds, window=window, least=least))
+        left = grid if out is None else replace(grid, points=np.where(out.found[:, None], np.nan, grid.points))
+        more = _reject_inconsistent(grid, grow(first, second, left, seeds, window=window, least=least))
         out = more if out is None else out.or_else(more)
         if more.found.sum() < _MIN_ADDED_SHARE * textured.sum():
             break
@@ -135,11 +136,6 @@ def _reject_inconsistent(grid: Grid, found: Matches) -> Matches:
         neighbours[cells] += np.isfinite(off)
         consistent[cells] += off <= grid.step / 2
     return found.only((2 * consistent >= np.maximum(neighbours, 1)).ravel())
-
-
-def _unmatched(grid: Grid, found: Matches | None) -> Grid:
-    """The grid without the points that are matched."""
-    return grid if found is None else replace(grid, points=np.where(found.found[:, None], np.nan, grid.points))
 
 
 _MAX_SIFT_IMAGE_PX = 1200  # larger images are reduced: features are larger than grains

@@ -43,7 +43,7 @@ class _LivePage:
 
     @property
     def _job(self) -> Job | None:
-        return self._desk.jobs.beside[-1] if self._desk.jobs.beside else None
+        return self._desk.jobs.sessions[-1] if self._desk.jobs.sessions else None
 
     async def _look(self) -> None:
         """Show the session anew if its state changed, and how much is recorded."""

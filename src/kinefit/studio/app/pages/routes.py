@@ -27,7 +27,7 @@ def add_pages(desk: Desk) -> None:
     """Register all pages of a desk with NiceGUI's application."""
 
     async def asked(page: Callable[..., Awaitable[None]], *arguments: object) -> None:
-        """A page; where nobody has said yet whether faces are shown, the first one, which asks for it."""
+        """A page; before it is chosen whether faces are shown, the first one, which asks for it."""
         if desk.hide_faces is None:
             ui.navigate.to("/")
         else:

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks.accuracy.people import people_one_camera as lines
+from benchmarks.commands import ended
 from benchmarks.figures import NotMeasured, data, figure, quick
 from kinefit import read_motion
 from kinefit.errors import AssetError, ObservationError
@@ -70,12 +71,12 @@ def _tracked(trial: Path, *, video: bool = False, pose: bool = False) -> Mapping
             shutil.copy(trial / "video.mp4", folder)
         if pose:
             shutil.copy(trial / "sample_mono.json", folder)
-        lines.command("init", str(folder))
+        ended("init", folder, check=True)
         take = folder / "take.toml"
         text = take.read_text().replace("# height = 1.75", f"height = {lines.stature(truth):.2f}  #" if video else "#")
         rows = [line for line in text.splitlines() if not line.startswith("rate =")]
         take.write_text("\n".join(rows).replace("[take]", f"[take]\nrate = {_RATE}", 1) + "\n")
-        lines.command("track", str(take), "--pictures", "none", "--no-report")
+        ended("track", take, "--pictures", "none", "--no-report", check=True)
         motion = read_motion(folder / "take-kinefit" / "motion.npz")
     scale = json.loads((trial / "sample_mocap.json").read_text())["bodies"]["pelvis"]["scaleFactors"][0]
     return lines.against(motion.times, lines.joints_of(motion, scale), times, truth, lines.std_of(motion))
