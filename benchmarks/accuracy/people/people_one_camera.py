@@ -38,8 +38,8 @@ _JOINTS = {
 """Bodies of the OpenSim model, and the segments of the humanoid that begin where they do."""
 
 NAMES = tuple(_JOINTS)
-_HIP, _BACK = np.array([-0.0563, -0.0785, 0.0]), np.array([-0.1007, 0.0815, 0.0])
-"""[m] middle of the hips and the back's joint in the pelvis's frame of the model that OpenCap scales (x forward)."""
+_BACK = np.array([-0.1007, 0.0815, 0.0])
+"""[m] the back's joint in the pelvis's frame of the model that OpenCap scales (x forward)."""
 
 _LONG = ("femur_r", "tibia_r"), ("tibia_r", "talus_r"), ("humerus_r", "ulna_r")
 _SHIFTS = np.arange(-0.12, 0.121, 0.01)  # [s] of the clocks
@@ -146,6 +146,7 @@ def joints_of_file(path: Path) -> tuple[NDArray, NDArray]:
 
 
 def stature(x: NDArray) -> float:
+    """[m] of a person whose joints these are (F, 12, 3), by thigh, shank and upper arm."""
     body = load_body("humanoid")
     rest = {name: body.tree.rest[body.tree.segment(s)] for name, s in _JOINTS.items() if s}
     pairs = [(NAMES.index(a), NAMES.index(b)) for a, b in _LONG]
@@ -155,13 +156,12 @@ def stature(x: NDArray) -> float:
 
 
 def joints_of(motion: Motion, scale: float) -> NDArray:
-    """(F, 12, 3) [m] where the model's bodies begin; pelvis and torso by how they lie to the hips in it."""
-    tree, centres = motion.body.tree, motion.joint_centres
-    x = np.stack([centres[:, tree.segment(s or "pelvis")] for s in _JOINTS.values()], axis=1)
-    hips = x[:, [NAMES.index("femur_r"), NAMES.index("femur_l")]].mean(axis=1)
-    R = motion.segment_poses()[:, 0, :3, :3]
-    x[:, NAMES.index("pelvis")] = hips - scale * R @ _HIP
-    x[:, NAMES.index("torso")] = hips + scale * R @ (_BACK - _HIP)
+    """(F, 12, 3) [m] where the model's bodies begin: the pelvis between its front spines, the torso as in the model."""
+    body, pelvis = motion.body, motion.segment_poses()[:, 0]
+    spines = np.mean([body.landmarks.points[body.landmarks.index(name)] for name in ("l_asis", "r_asis")], axis=0)
+    x = np.stack([motion.joint_centres[:, body.tree.segment(s or "pelvis")] for s in _JOINTS.values()], axis=1)
+    x[:, NAMES.index("pelvis")] = se3.apply(pelvis, spines - body.tree.rest[0])
+    x[:, NAMES.index("torso")] = x[:, NAMES.index("pelvis")] + scale * pelvis[:, :3, :3] @ _BACK
     return x
 
 
@@ -173,6 +173,7 @@ def std_of(motion: Motion) -> NDArray:
 def against(
     times: NDArray, x: NDArray, marker_times: NDArray, truth: NDArray, std: NDArray | None = None
 ) -> dict[str, float]:
+    """Figures of joints (F, 12, 3) [m] with their deviations against those by markers (G, 12, 3) [m]; times [s]."""
     T, there = laid_on(x, times, marker_times, truth)
     on = se3.apply(T, x)
     apart = np.linalg.norm((on - on[:, :1]) - (there - there[:, :1]), axis=2)[:, 1:]
