@@ -12,6 +12,7 @@ from kinefit.errors import FileError, KinefitError, ObservationError
 from kinefit.exporters.motion_file import write_motion
 from kinefit.exporters.opensim import write_trc
 from kinefit.exporters.skeletons.bvh import write_bvh
+from kinefit.findings import of_provenance
 from kinefit.readers.guess.folder import guess_take
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
@@ -169,3 +170,12 @@ def test_takes_that_are_refused(tmp_path, more, said):
     take.write_text(take.read_text() + more + "\n")
     with pytest.raises(KinefitError, match=said):
         track_take(read_take(take))
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_joints_that_are_of_no_body_are_named(tmp_path, right):
+    random = np.random.default_rng(1)
+    x = joints() + 0.003 * random.normal(size=(COUNT, len(PLACES), 3))
+    motion, _ = track_take(written(tmp_path, x if right else random.permuted(x, axis=1)))
+    found = [f for f in of_provenance(motion.provenance) if f.kind == "pose"]
+    assert not found if right else "joints.json fit neither one body" in found[0].text and found[0].severity == "fault"

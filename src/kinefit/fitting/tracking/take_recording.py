@@ -48,6 +48,9 @@ from kinefit.sensors.settings import TrackSettings
 FLOOR = "floor"
 """Key of `Motion.provenance`: the floor that was found from the feet, and how the world was moved onto it."""
 
+_REJECTED_WEIGHT = 0.3  # robust weight, of 1, below which a joint hardly counts
+_MAX_REJECTED_SHARE = 0.05  # of a file's joints: 0.001 where it is right; 0.19 of a slowed, 0.27 of another video's
+
 _MAX_LOST = 0.5  # share of frames in which the feet may be lost, to tell a floor
 
 _EMPTY = 30  # images of an empty scene that are looked at: more add nothing
@@ -343,6 +346,23 @@ def label_findings_of(take: Take, seen: Observations, body: Body, *, refuse: boo
                 refuse_wrong_sides(found)
             out += found
     return *out, *pose_findings_of(take, seen, body, refuse=refuse)
+
+
+def pose_contradictions(motion: Motion, seen: Observations) -> list[Finding]:
+    """Files of poses many of whose joints the fit rejected: other sensors, or constant bones, contradict them."""
+    found = []
+    for of in seen.sensors:
+        if of.kind.table != "pose" or (left := motion.residuals.get(of.recording.sensor)) is None:
+            continue
+        known = np.isfinite(left.norms)
+        rejected = float(np.mean(left.weights[known] < _REJECTED_WEIGHT)) if known.any() else 0.0
+        if rejected > _MAX_REJECTED_SHARE:
+            name, share = of.entry.file.name, f"{100 * rejected:.0f} %"
+            text = f"{share} of the joints of {name} fit neither one body nor the other measurements."
+            sure = "Likely: the file is of another video or person, or its times are not those of the take."
+            remedy = "Compare them, state its rate or time_offset, or leave out [[pose]]."
+            found.append(Finding("fault", "pose", text, (), sure, remedy))
+    return found
 
 
 def pose_findings_of(take: Take, seen: Observations, body: Body, *, refuse: bool = False) -> tuple[Finding, ...]:
