@@ -22,6 +22,7 @@ AREAS: dict[str, dict[str, str]] = {
     "networks": {
         "networks_decode": "points of ONNX networks beside the published decoding; cost beside the network's own run",
         "networks_sigma": "standard deviations by confidence, in cameras that were held out",
+        "second_opinion": "poses that another program made of a video: alone, and with the video, against markers",
         "looking": "detection that skips images: time, and the motion beside that of every image",
     },
     "depth": {

@@ -128,12 +128,12 @@ def _two_people() -> None:
 def _one() -> None:
     trial = whole_recording("video_mono_opencap") / "STS"
     times, truth = markers.joints_of_file(trial / "sample_mocap.json")
-    head = f"height = {markers._stature(truth):.2f}\n"
+    head = f"height = {markers.stature(truth):.2f}\n"
     with tempfile.TemporaryDirectory() as folder:
         every, some = _both(folder, head, {"cam": trial / "video.mp4"})
         motions = [track_take(one.take)[0] for one in (every, some)]
     _figures("one", every, some, motions)
-    found = [markers._against(m.times, markers.joints_of(m, 1.0), times, truth, markers._std_of(m)) for m in motions]
+    found = [markers.against(m.times, markers.joints_of(m, 1.0), times, truth, markers.std_of(m)) for m in motions]
     for name in ("relative", "absolute", "knee", "inside_least", "inside_most"):
         first, second = (one[f"one_camera_{name}"] for one in found)
         print(f"# against markers, {name}: {first:.1f} with every look, {second:.1f} with some", flush=True)

@@ -29,7 +29,7 @@ from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry import se3
 from kinefit.takes.preparing import detecting
 
-_TRIALS = "STS", "walk_ts"
+TRIALS = "STS", "walk_ts"
 _JOINTS = {
     "pelvis": "", "femur_r": "thigh_r", "tibia_r": "shank_r", "talus_r": "foot_r", "femur_l": "thigh_l",
     "tibia_l": "shank_l", "talus_l": "foot_l", "torso": "", "humerus_r": "upperarm_r", "ulna_r": "forearm_r",
@@ -38,8 +38,8 @@ _JOINTS = {
 """Bodies of the OpenSim model, and the segments of the humanoid that begin where they do."""
 
 NAMES = tuple(_JOINTS)
-_HIP, _BACK = np.array([-0.0707, -0.0661, 0.0]), np.array([-0.1007, 0.0815, 0.0])
-"""[m] middle of the hips and the back's joint in the pelvis's frame of the model that OpenCap scales (x forward)."""
+_BACK = np.array([-0.1007, 0.0815, 0.0])
+"""[m] the back's joint in the pelvis's frame of the model that OpenCap scales (x forward)."""
 
 _LONG = ("femur_r", "tibia_r"), ("tibia_r", "talus_r"), ("humerus_r", "ulna_r")
 _SHIFTS = np.arange(-0.12, 0.121, 0.01)  # [s] of the clocks
@@ -64,7 +64,7 @@ def run() -> None:
     if root is None:
         raise NotMeasured(missing)
     errors = []
-    for trial in _TRIALS[1:] if quick() else _TRIALS:
+    for trial in TRIALS[1:] if quick() else TRIALS:
         with tempfile.TemporaryDirectory() as folder:
             shutil.copy(root / trial / "video.mp4", Path(folder, f"{trial}.mp4"))
             errors.append(_of_trial(root / trial, Path(folder), trial))
@@ -80,26 +80,26 @@ def run() -> None:
 
 def _of_trial(markers: Path, folder: Path, trial: str) -> Mapping[str, float]:
     times, truth = joints_of_file(markers / "sample_mocap.json")
-    rival = _against(*joints_of_file(markers / "sample_mono.json"), times, truth)
-    stature = _stature(truth)
+    rival = against(*joints_of_file(markers / "sample_mono.json"), times, truth)
+    height = stature(truth)
     ended("init", folder, check=True)
     take = folder / "take.toml"
-    take.write_text(take.read_text().replace("# height = 1.75", f"height = {stature:.2f}  #"))
+    take.write_text(take.read_text().replace("# height = 1.75", f"height = {height:.2f}  #"))
     _, seconds = took(lambda: ended("track", take, check=True), clock=time.perf_counter)
     motion = read_motion(folder / "take-kinefit" / "motion.npz")
     take.write_text(take.read_text().replace("height = ", "# height = "))
     ended("track", take, "--pictures", "none", "--no-report", check=True)
     without = read_motion(folder / "take-kinefit" / "motion.npz")
     scale = json.loads((markers / "sample_mocap.json").read_text())["bodies"]["pelvis"]["scaleFactors"][0]
-    ours = _against(motion.times, joints_of(motion, scale), times, truth, _std_of(motion))
+    ours = against(motion.times, joints_of(motion, scale), times, truth, std_of(motion))
     for name, found in (("kinefit", ours), ("OpenCap Monocular", rival)):
         told = ", ".join(f"{k.removeprefix('one_camera_')} {v:.3g}" for k, v in found.items() if v == v)
         print(f"{trial}, {name}: {told}", flush=True)
-    unstated = _against(without.times, joints_of(without, scale), times, truth)
+    unstated = against(without.times, joints_of(without, scale), times, truth)
     print(f"{trial}, no stature: relative {unstated['one_camera_relative']:.1f}, "
           f"absolute {unstated['one_camera_absolute']:.1f}, height {without.body.stature:.2f} m", flush=True)
     lost, quality = motion.lost.mean(), motion.quality.mean()
-    print(f"{trial}: {lost:.1%} of segments lost, quality {quality:.2f}, height {stature:.2f} m", flush=True)
+    print(f"{trial}: {lost:.1%} of segments lost, quality {quality:.2f}, height {height:.2f} m", flush=True)
     print(f"{trial}: {len(motion)} frames in {seconds:.1f} s", flush=True)
     ours["one_camera_absolute_without_stature"] = unstated["one_camera_absolute"]
     return {**ours, "frames": len(motion), "seconds": seconds}
@@ -128,7 +128,7 @@ def _balancing() -> None:
             take = folder / "take.toml"
             take.write_text(take.read_text().replace("# height = 1.75", f"height = {truth.body.stature:.2f}  #"))
             motion = _tracked(take)
-            alone.append(_against(motion.times, joints_of(motion, 1.0), truth.times, x, _std_of(motion)))
+            alone.append(against(motion.times, joints_of(motion, 1.0), truth.times, x, std_of(motion)))
     for name in ("relative", "absolute", "knee", "inside_least"):
         values = [one[f"one_camera_{name}"] for one in alone]
         print(f"# balancing trial, each camera alone: {name} {np.mean(values):.1f} ({np.round(values, 1)})", flush=True)
@@ -145,7 +145,8 @@ def joints_of_file(path: Path) -> tuple[NDArray, NDArray]:
     return np.array(told["time"]), np.stack([np.array(told["bodies"][n]["translation"]) for n in NAMES], axis=1)
 
 
-def _stature(x: NDArray) -> float:
+def stature(x: NDArray) -> float:
+    """[m] of a person whose joints these are (F, 12, 3), by thigh, shank and upper arm."""
     body = load_body("humanoid")
     rest = {name: body.tree.rest[body.tree.segment(s)] for name, s in _JOINTS.items() if s}
     pairs = [(NAMES.index(a), NAMES.index(b)) for a, b in _LONG]
@@ -155,24 +156,24 @@ def _stature(x: NDArray) -> float:
 
 
 def joints_of(motion: Motion, scale: float) -> NDArray:
-    """(F, 12, 3) [m] where the model's bodies begin; pelvis and torso by how they lie to the hips in it."""
-    tree, centres = motion.body.tree, motion.joint_centres
-    x = np.stack([centres[:, tree.segment(s or "pelvis")] for s in _JOINTS.values()], axis=1)
-    hips = x[:, [NAMES.index("femur_r"), NAMES.index("femur_l")]].mean(axis=1)
-    R = motion.segment_poses()[:, 0, :3, :3]
-    x[:, NAMES.index("pelvis")] = hips - scale * R @ _HIP
-    x[:, NAMES.index("torso")] = hips + scale * R @ (_BACK - _HIP)
+    """(F, 12, 3) [m] where the model's bodies begin: the pelvis between its front spines, the torso as in the model."""
+    body, pelvis = motion.body, motion.segment_poses()[:, 0]
+    spines = np.mean([body.landmarks.points[body.landmarks.index(name)] for name in ("l_asis", "r_asis")], axis=0)
+    x = np.stack([motion.joint_centres[:, body.tree.segment(s or "pelvis")] for s in _JOINTS.values()], axis=1)
+    x[:, NAMES.index("pelvis")] = se3.apply(pelvis, spines - body.tree.rest[0])
+    x[:, NAMES.index("torso")] = x[:, NAMES.index("pelvis")] + scale * pelvis[:, :3, :3] @ _BACK
     return x
 
 
-def _std_of(motion: Motion) -> NDArray:
+def std_of(motion: Motion) -> NDArray:
     """(F, 12, 3) [m] of the joints in the world's axes."""
     return np.stack([motion.joint_std[:, motion.body.tree.segment(s or "pelvis")] for s in _JOINTS.values()], axis=1)
 
 
-def _against(
+def against(
     times: NDArray, x: NDArray, marker_times: NDArray, truth: NDArray, std: NDArray | None = None
 ) -> dict[str, float]:
+    """Figures of joints (F, 12, 3) [m] with their deviations against those by markers (G, 12, 3) [m]; times [s]."""
     T, there = laid_on(x, times, marker_times, truth)
     on = se3.apply(T, x)
     apart = np.linalg.norm((on - on[:, :1]) - (there - there[:, :1]), axis=2)[:, 1:]

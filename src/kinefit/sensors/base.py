@@ -279,6 +279,7 @@ class Sensor(ABC):
     together : whether `prepare` takes a list of all its frames of one time, in place of one frame
     places_points : whether a measurement's `hints` locate named points of the body in any pose
     shows_person : whether it shows a whole person, so that a search in it takes long
+    follows : whether its data are in a frame of their own, which the poses by other sensors place
     state_attributes : names of the attributes that change while it tracks; checkpoints keep those of kinefit's sensors
     """
 
@@ -287,11 +288,19 @@ class Sensor(ABC):
     together: bool = False
     places_points: bool = False
     shows_person: bool = False
+    follows: bool = False
     state_attributes: Sequence[str] = ()
 
     @abstractmethod
     def prepare(self, frame: Any, scene: Scene) -> Measurement:
         """The measurement of one frame, ready to be matched; the scene has the body at its prediction."""
+
+    def person_size(self, body: Body) -> tuple[float, float] | None:
+        """Size of the person as a share of a body's and the standard deviation of its logarithm; None if it has none.
+
+        Beside markers and one camera it counts in place of the rows, which then tell poses, but no lengths.
+        """
+        return None
 
     def learn(self, measurement: Any, scene: Scene, sure: bool) -> None:  # noqa: B027
         """Learn from an accepted step; `sure` if no segment is lost.

@@ -14,7 +14,7 @@ from kinefit.findings import Finding
 from kinefit.fitting.markers.subject import fit_marker_subject
 from kinefit.fitting.subject.subject import Subject
 from kinefit.fitting.tracking.sizing import SizedPerson, sized_by_depth
-from kinefit.fitting.tracking.take_recording import label_findings_of, recording_of, sensors_of
+from kinefit.fitting.tracking.take_recording import label_findings_of, pose_findings_of, recording_of, sensors_of
 from kinefit.fitting.tracking.video import fit_markers
 from kinefit.readers.take.cameras import is_alone
 from kinefit.readers.take.file import Take, read_take
@@ -58,9 +58,9 @@ def check_take(
 
 
 def _labels(c: Checked) -> Iterable[Finding]:
-    """Labels of markers; those without names, by the take's models, are not looked at."""
+    """Labels of markers and sides of poses; markers without names, by the take's models, are not looked at."""
     named = c.take.markers and not any(entry.model for entry in c.take.markers)
-    return label_findings_of(c.take, c.observations, load_body(c.take.body)) if named else ()
+    return (label_findings_of if named else pose_findings_of)(c.take, c.observations, load_body(c.take.body))
 
 
 def _depth_alone(c: Checked) -> list[Finding]:

@@ -104,7 +104,8 @@ def track_take(
         except KinefitError as error:
             raise with_cause(error, findings) from error
     motion = replace(motion.with_mass(_mass_of(take, seen, motion.body)), plates=seen.plates, events=seen.events)
-    motion = with_findings(motion, (*findings, *foot_findings(motion)), seen, take.height)
+    findings = (*findings, *take_recording.pose_contradictions(motion, seen), *foot_findings(motion))
+    motion = with_findings(motion, findings, seen, take.height)
     motion = take_recording.on_floor(motion, recording, view.floors if view else [])
     if seen.rig is not None:
         seen = replace(seen, rig=take_recording.rig_on_floor(as_found(seen.rig, motion.provenance), motion.provenance))

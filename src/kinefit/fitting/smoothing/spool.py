@@ -25,6 +25,7 @@ from kinefit.sensors.points.image_lines import ImageLineMatched, ImageLineMeasur
 from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement
 from kinefit.sensors.points.lifted import LiftedMatched, LiftedMeasurement
 from kinefit.sensors.points.markers import MarkerMatched, MarkerMeasurement
+from kinefit.sensors.points.poses import PoseMatched, PoseMeasurement
 from kinefit.sensors.regions.region_parts import Coloured, Kept, Lines, Seams
 from kinefit.sensors.regions.regions import RegionMatched, RegionMeasurement
 from kinefit.sensors.regions.silhouette import SilhouetteMatched, SilhouetteMeasurement
@@ -40,7 +41,7 @@ CODEC = Codec([
     KeypointMatched, KeypointMeasurement, LiftedMatched, LiftedMeasurement, MarkerMatched, MarkerMeasurement, Hidden,
     PointCloudMatched, PointCloudMeasurement, Coloured, Kept, RegionMatched, Lines, Seams, RegionMeasurement,
     SilhouetteMatched, SilhouetteMeasurement, FreePairs, SurfacePairs, SurfacePointMatched, SurfacePointMeasurement,
-    BodyTrackerMatched, BodyTrackerMeasurement,
+    BodyTrackerMatched, BodyTrackerMeasurement, PoseMatched, PoseMeasurement,
 ])  # fmt: skip
 """Writes and reads records of tracked frames, without what all frames share (bodies, sensors, cameras)."""
 

@@ -186,9 +186,10 @@ class Recording:
 
     @property
     def alone(self) -> Camera | None:
-        """The camera that is the only sensor, its landmarks lifted to space."""
+        """The camera that is the only sensor, but for those that follow it, its landmarks lifted to space."""
         lifted = only_lifted(self.keypoints)
-        others = self.markers or self.depth or self.sensors or self.backgrounds or len(self.rig) > 1
+        of_world = any(not sensor.follows for sensor in self.sensors)
+        others = self.markers or self.depth or of_world or self.backgrounds or len(self.rig) > 1
         return None if lifted is None or others else self.rig[lifted.camera]
 
     @classmethod

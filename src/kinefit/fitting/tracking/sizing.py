@@ -322,7 +322,8 @@ def _by_all(
             states=states,
         )  # fmt: skip
     if points is not None:
-        seen, stated = [[m for m in several if m.settled] for several in steps], points
+        own = {sensor.name for sensor in r.sensors if sensor.person_size(generic) is not None}
+        seen, stated = [[m for m in several if m.settled and m.sensor not in own] for several in steps], points
         found = fit(points, seen, states)
         for _ in range(_PLACES if r.markers else 0):
             points = points.with_places_of(found, stated)
@@ -331,7 +332,7 @@ def _by_all(
     lengths = points is None and person.subject.fit is None and not person.joint
     left = of_all(
         person.recording, person.subject.body, size=size, lengths=lengths, surfaces=surfaces, steps=steps,
-        states=states,
+        states=states, height=height,
     )  # fmt: skip
     if left is not None:
         found = fit(left, steps, states)

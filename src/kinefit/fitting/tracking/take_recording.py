@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,10 +42,14 @@ from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.videos import load_stereo, stereo_sigma
 from kinefit.sensors.base import Sensor
+from kinefit.sensors.points.poses import PoseSensor
 from kinefit.sensors.settings import TrackSettings
 
 FLOOR = "floor"
 """Key of `Motion.provenance`: the floor that was found from the feet, and how the world was moved onto it."""
+
+_REJECTED_WEIGHT = 0.3  # robust weight, of 1, below which a joint hardly counts
+_MAX_REJECTED_SHARE = 0.05  # of a file's joints: 0.001 where it is right; 0.19 of a slowed, 0.27 of another video's
 
 _MAX_LOST = 0.5  # share of frames in which the feet may be lost, to tell a floor
 
@@ -148,7 +152,9 @@ def recording_of(
         sensors=sensors_of(take, seen, body),
     )  # fmt: skip
     if seen.keypoints:
-        bare = set(videos) <= set(seen.clicks) and not (marked or recording.sensors)  # else what is lifted adds nothing
+        following = {sensor.name for sensor in recording.sensors if sensor.follows}
+        others = {video.sensor for video in videos if video not in seen.clicks} | {s.name for s in recording.sensors}
+        bare = others <= following and not marked  # else what is lifted adds nothing
         keypoints = seen.keypoints if bare else [replace(k, lifted=None) for k in seen.keypoints]
         pixels = Recording.of_keypoints(
             rig, keypoints, sigma=[entry.sigma for entry in take.keypoints], person=take.person, people=people
@@ -339,6 +345,51 @@ def label_findings_of(take: Take, seen: Observations, body: Body, *, refuse: boo
             if refuse:
                 refuse_wrong_sides(found)
             out += found
+    return *out, *pose_findings_of(take, seen, body, refuse=refuse)
+
+
+def pose_contradictions(motion: Motion, seen: Observations) -> list[Finding]:
+    """Files of poses many of whose joints the fit rejected: other sensors, or constant bones, contradict them."""
+    found = []
+    for of in seen.sensors:
+        if of.kind.table != "pose" or (left := motion.residuals.get(of.recording.sensor)) is None:
+            continue
+        known = np.isfinite(left.norms)
+        rejected = float(np.mean(left.weights[known] < _REJECTED_WEIGHT)) if known.any() else 0.0
+        if rejected > _MAX_REJECTED_SHARE:
+            name, share = of.entry.file.name, f"{100 * rejected:.0f} %"
+            text = f"{share} of the joints of {name} fit neither one body nor the other measurements."
+            sure = "Likely: the file is of another video or person, or its times are not those of the take."
+            remedy = "Compare them, state its rate or time_offset, or leave out [[pose]]."
+            found.append(Finding("fault", "pose", text, (), sure, remedy))
+    return found
+
+
+def pose_findings_of(take: Take, seen: Observations, body: Body, *, refuse: bool = False) -> tuple[Finding, ...]:
+    """Check the sides of the joints that other programs estimated, as those of markers.
+
+    Raises
+    ------
+    ObservationError
+        With `refuse`: the sides of a file are wrong.
+    """
+    out, entries = list[Finding](), {of.recording.sensor: of for of in seen.sensors}
+    for sensor in (one for one in sensors_of(take, seen, body) if isinstance(one, PoseSensor)):
+        entry, recording = entries[sensor.name].entry, cast(Any, entries[sensor.name].recording)
+        used = [name for name in recording.names if name in sensor.points]
+        names = tuple(place if isinstance(place := sensor.points[name], str) else name for name in used)
+        points, std = replace(sensor.places(body, used), names=names), sensor.errors.offset + sensor.errors.sigma
+        x = recording.x_world[:, [recording.names.index(name) for name in used]]
+        with located(entry.file, f"[[pose]] {sensor.name}"):
+            found: tuple[Finding, ...] = ()
+            with suppress(KinefitError):  # which tracking raises
+                placed = MarkerPlacement(sensor.name, points, np.full(len(points), std))
+                seen_as = Markers(names, recording.rate, x, up=take.up.strip("-"))
+                found = label_findings(body, seen_as, placed, sides=entry.sides)
+            found = tuple(f for f in found if (f.severity, f.kind) == ("fault", "sides"))
+            out += [replace(f, remedy=f.remedy.replace("[[markers]]", "[[pose]]")) for f in found]
+            if refuse:
+                refuse_wrong_sides(tuple(out))
     return tuple(out)
 
 

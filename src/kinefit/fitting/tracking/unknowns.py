@@ -95,7 +95,7 @@ def of_points(
     places = {name: generic.markers(name).select(points.names) for name, points in worn.items()}
     stds = {n: _SEAT if s is None else _of(s, generic.markers(n), places[n]) for n, s in sets.items()}
     generic = replace(generic, marker_sets={**generic.marker_sets, **places})
-    lengths = _size_by_network(generic, recording)
+    lengths = _size_by_sensors(generic, recording)
     if height and generic.stature:
         lengths = kinds.SegmentScales(generic, height / generic.stature)
     if trial is not None and trial.covariance is not None:
@@ -119,14 +119,15 @@ def of_points(
     return _together(kinds.World(generic, recording.rig), found)
 
 
-def _size_by_network(body: Body, recording: Recording) -> kinds.SegmentScales:
-    """Lengths whose common size is that of people, and by a network's metres where it lifted landmarks to space."""
+def _size_by_sensors(body: Body, recording: Recording) -> kinds.SegmentScales:
+    """Lengths whose common size is that of people, by the metres of a network that lifted landmarks and of sensors."""
     record = only_lifted(recording.keypoints)
-    size = np.nan if record is None else person_size(body, record)
-    if not np.isfinite(size):
-        return kinds.SegmentScales(body)
-    share = kinds.UNKNOWN_SIZE_STD**2 / (kinds.UNKNOWN_SIZE_STD**2 + SIZE_STD**2)
-    return kinds.SegmentScales(body, about=size**share, about_std=SIZE_STD * share**0.5)
+    found = [sensor.person_size(body) for sensor in recording.sensors]
+    found += [] if record is None else [(person_size(body, record), SIZE_STD)]
+    known = np.array([(np.log(one[0]), one[1] ** -2) for one in found if one and np.isfinite(one[0])]).reshape(-1, 2)
+    information = kinds.UNKNOWN_SIZE_STD**-2 + known[:, 1].sum()
+    about = float(np.exp(known[:, 0] @ known[:, 1] / information))
+    return kinds.SegmentScales(body, about=about, about_std=information**-0.5)
 
 
 def _of(values: NDArray, whole: PointSet, part: PointSet) -> NDArray:
@@ -136,7 +137,7 @@ def _of(values: NDArray, whole: PointSet, part: PointSet) -> NDArray:
 
 def of_all(
     recording: Recording, body: Body, *, size: bool, lengths: bool, surfaces: bool,
-    steps: Sequence[Sequence[Measurement]] = (), states: Sequence[BodyState] = (),
+    steps: Sequence[Sequence[Measurement]] = (), states: Sequence[BodyState] = (), height: float | None = None,
 ) -> Unknowns | None:  # fmt: skip
     """What is left for all sensors together: the body's surface, gear, and what sensors do not know of themselves.
 
@@ -148,10 +149,12 @@ def of_all(
         shapes, frame after frame, are surer of lengths than they are right
     surfaces : whether any sensor sees them
     steps, states : what was measured at some poses of the body, which tell where gear and sensors' unknowns begin
+    height : [m] to which the body was scaled, as it is stated
     """
     found: list[tuple[kinds.Parameters, NDArray]] = []
     if size and lengths and (surfaces or recording.markers or any(s.places_points for s in recording.sensors)):
-        found.append((_size_by_network(body, recording), np.zeros(len(body.scale_groups))))
+        known = kinds.SegmentScales(body, 1.0 if height else None)
+        found.append((known, np.zeros(len(body.scale_groups))))
     if size and surfaces:
         found += [(shape, shape.mean) for shape in shape_of(body)]
     found += _gear(body, states)

@@ -144,7 +144,7 @@ def _names(take: Take) -> _Odd:
     cameras = [entry.name for entry in take.cameras]
     videos = [entry.name for entry in take.cameras if entry.video is not None]
     for table, place, entry in entries:
-        if table not in ("camera", "depth") and hasattr(entry, "camera") and entry.camera not in cameras:
+        if table not in ("camera", "depth") and getattr(entry, "camera", None) not in (None, *cameras):
             remedy = f'Add [[camera]] with name = "{entry.camera}", or correct the name.'
             yield choices("camera", entry.camera, cameras), place, remedy
         seen = table == "region" or getattr(entry, "format", "") in ("background", "threshold", "skin")

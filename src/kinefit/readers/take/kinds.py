@@ -27,6 +27,7 @@ BUILT_IN = {
     "lines": "kinefit.sensors.kinds.lines:KIND",
     "surface_points": "kinefit.sensors.kinds.surface_points:KIND",
     "tracker": "kinefit.sensors.kinds.trackers:KIND",
+    "pose": "kinefit.sensors.kinds.poses:KIND",
 }
 """{table of a take file: where its kind stands}, in the order in which they are read."""
 

@@ -33,7 +33,7 @@ SIZE_STD = 0.08
 of one person, and the network takes all people for nearly as tall: 9 % too much and too little for two others."""
 
 _NETWORK_SIZE = 0.91  # of a person, by its metres: 0.94, 0.94, 0.90, 0.85 in each camera of the balancing trial
-_MIN_BONE_SHARE = 0.5  # of the longest bone: lengths in face, hands and feet are 0.2 to 1.5 times the person's
+MIN_BONE_SHARE = 0.5  # of the longest bone: lengths in face, hands and feet are 0.2 to 1.5 times the person's
 
 
 class LiftedSensor(Sensor):
@@ -84,7 +84,7 @@ def _on(body: Body, keypoint_set: str, names: tuple[str, ...]) -> OnBody:
     points, middle = known.select(names), body.points_rest(known.select(HIPS)).mean(axis=0)
     pairs = rigid_pairs(body, points)
     longest = max((pair[3] for pair in pairs), default=0.0)
-    pairs = [pair for pair in pairs if pair[3] > _MIN_BONE_SHARE * longest]
+    pairs = [pair for pair in pairs if pair[3] > MIN_BONE_SHARE * longest]
     first, second = (np.array([pair[k] for pair in pairs], np.int64) for k in (0, 1))
     hips = PointSet(("hips",), np.zeros(1, np.int64), middle[None] - body.tree.rest[0])
     both = PointSet(
