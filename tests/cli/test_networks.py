@@ -8,7 +8,13 @@ from click.testing import CliRunner
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
-from benchmarks.scenes.onnx_networks import constant_network, draw, heatmap_network, simcc_network, yolox_network
+from benchmarks.accuracy.detection.onnx_networks import (
+    constant_network,
+    draw,
+    heatmap_network,
+    simcc_network,
+    yolox_network,
+)
 
 from kinefit.cli import main
 from kinefit.cli.detect import detect

@@ -31,7 +31,7 @@ def run() -> None:
     """Print the figures."""
     try:
         onnx_runtime()
-        from benchmarks.scenes.onnx_networks import heatmap_network, simcc_network
+        from benchmarks.accuracy.detection.onnx_networks import heatmap_network, simcc_network
     except (ObservationError, ImportError) as error:
         raise NotMeasured(f"no onnxruntime ({error})") from error
     with tempfile.TemporaryDirectory() as folder:
@@ -85,7 +85,7 @@ def _large(file: Path, name: str) -> Path:
     """A network of random convolutions with as many operations as RTMPose-m."""
     from onnx import TensorProto, helper, numpy_helper
 
-    from benchmarks.scenes.onnx_networks import save
+    from benchmarks.accuracy.detection.onnx_networks import save
 
     rng, width = np.random.default_rng(1), 128
     cells = _SIZE[0] // 8 * _SIZE[1] // 8

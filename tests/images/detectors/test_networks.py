@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
-from benchmarks.scenes.onnx_networks import (
+from benchmarks.accuracy.detection.onnx_networks import (
     COLOURS,
     constant_network,
     draw,
@@ -146,7 +146,7 @@ def test_files_that_are_no_networks_are_named(tmp_path):
 
 def _of_kind(file, outputs, given):
     """A network without operators on its input, of any type."""
-    from benchmarks.scenes.onnx_networks import save
+    from benchmarks.accuracy.detection.onnx_networks import save
     from onnx import helper, numpy_helper
 
     image = helper.make_tensor_value_info("image", given.get("kind", 1), given.get("shape", [1, 3, 256, 192]))
