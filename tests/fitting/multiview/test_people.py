@@ -214,6 +214,19 @@ def test_a_passer_by_is_nobody():
     assert len(_found(records([a, b], unseen=in_two))[0]) == 1
 
 
+def test_two_are_found_of_whom_the_detector_looked_at_every_fourth_image():
+    """And a third, seen in a quarter of the looks, is a passer-by as in every image."""
+    paths = [(0.0, 0.0, 0.4, 0.0), (0.9, 0.7, 1.0, 0.6), (-1.0, -0.6, -0.8, -0.6)]
+    walking = [along(line((a, 0.0, b), (c, 0.0, d), 60), seed) for seed, (a, b, c, d) in enumerate(paths)]
+    keypoints, truth = records(walking, unseen=[(2, None, 0, 45)])
+    looked = np.arange(60) % 4 == 0
+    keypoints = [replace(k.without(~looked), looked=looked) for k in keypoints]
+    truth = [np.where(looked[:, None], places, -1) for places in truth]
+    whose = owners(people_of(RIG, keypoints), truth)
+    assert sorted(np.unique(w[w >= 0]).tolist() for w in whose) == [[0], [1]]
+    assert (whose >= 0)[:, :, looked].mean() > 0.9
+
+
 def test_two_cameras_are_enough_where_there_are_no_more():
     assert [views_needed(n) for n in (1, 2, 3, 4, 8)] == [1, 2, 2, 3, 3]
     rig = RIG.select(RIG.names[:2])

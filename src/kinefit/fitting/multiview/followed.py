@@ -241,7 +241,7 @@ def people_of_one_camera(rig: Rig, keypoints: Sequence[Keypoints], record: Keypo
     confidence, people = confidences(record, frames), []
     for column in range(record.points.shape[1]):
         visible = confidence[:, column] > 0
-        if visible.sum() < max(min_person_frames(record.rate, frames), 1):
+        if visible.sum() < max(min_person_frames([record], frames), 1):
             continue
         chosen = np.where(visible, column, -1)
         x = _points_world(rig[record.camera], record, column)

@@ -77,12 +77,16 @@ def may_be_several(keypoints: Sequence[Keypoints]) -> bool:
         of_camera[k.camera] = np.maximum(of_camera.get(k.camera, 0), count)
     people_count = np.sum([np.minimum(count, 2) for count in of_camera.values()], axis=0)
     enough = people_count >= 2 * views_needed(len(of_camera))
-    return bool(frames) and np.sum(enough) >= min_person_frames(keypoints[0].rate, frames)
+    return bool(frames) and np.sum(enough) >= min_person_frames(keypoints, frames)
 
 
-def min_person_frames(rate: float, frames: int) -> float:
-    """Least number of frames with a person, at `rate` [Hz] in a take of `frames`: a second, or half of a short take."""
-    return min(_MIN_PRESENCE_S * rate, 0.5 * frames)
+def min_person_frames(keypoints: Sequence[Keypoints], frames: int) -> float:
+    """Least number of frames with a person in a take of `frames`: a second, or half of a short take.
+
+    Of records whose detector skipped images, as many of these as it looked at.
+    """
+    looked = min(1.0 if k.looked is None else float(k.looked[:frames].mean()) for k in keypoints)
+    return looked * min(_MIN_PRESENCE_S * keypoints[0].rate, 0.5 * frames)
 
 
 def people_of(rig: Rig, keypoints: Sequence[Keypoints], images: ImageSource | None = None) -> list[PersonTrack]:
@@ -104,7 +108,7 @@ def people_of(rig: Rig, keypoints: Sequence[Keypoints], images: ImageSource | No
         search.forward(f)
     for f in reversed(range(search.frames)):
         search.backward(f)
-    needed, min_frames = search.needed, min_person_frames(keypoints[0].rate, search.frames)
+    needed, min_frames = search.needed, min_person_frames(search.keypoints, search.frames)
     spans = [PresenceSpan(t.nodes, t.path) for t in search.tracks]
     people: list[tuple[PersonTrack, Chain]] = []
     for chain in link_spans(rig, search.keypoints, spans, needed, images):
