@@ -179,3 +179,12 @@ def test_joints_that_are_of_no_body_are_named(tmp_path, right):
     motion, _ = track_take(written(tmp_path, x if right else random.permuted(x, axis=1)))
     found = [f for f in of_provenance(motion.provenance) if f.kind == "pose"]
     assert not found if right else "joints.json fit neither one body" in found[0].text and found[0].severity == "fault"
+
+
+def test_a_place_that_the_body_lacks_is_a_fault_of_the_check(tmp_path):
+    take = written(tmp_path)
+    places = {**dict(zip(names(), PLACES)), names()[1]: "no_such_point"}
+    take.write_text(take.read_text() + "joints = {" + ", ".join(f'{n} = "{p}"' for n, p in places.items()) + "}\n")
+    assert any("no_such_point" in f.text for f in check_take(take).findings if f.severity == "fault")
+    with pytest.raises(KinefitError, match="no_such_point"):
+        track_take(take)

@@ -377,7 +377,7 @@ WRONG = [
     ("have \\(80, 60\\)", ObservationError, lambda: [DepthFrame("depth", 0.0, np.ones((60, 80)))]),
     ("depth2", CalibrationError, lambda: [DepthFrame("depth2", 0.0, np.ones((120, 160)))]),
     ("middle", CalibrationError, lambda: [replace(keypoint_frame(0, "left"), sensor="middle")]),
-    ("COCO_18", BodyError, lambda: [replace(keypoint_frame(0, "left"), keypoint_set="COCO_18")]),
+    ("COCO_99", BodyError, lambda: [replace(keypoint_frame(0, "left"), keypoint_set="COCO_99")]),
     ("marker set", BodyError, lambda: [replace(marker_frame(0, FEW), marker_set="plug-in")]),
     ("tail", BodyError, lambda: [PointCloud("scan", 0.0, np.zeros((1, 3)), segment="tail")]),
     ("viewpoint", ObservationError, lambda: [PointCloud("scan", 0.0, np.zeros((1, 3)), viewpoint=(0, np.nan, 0))]),

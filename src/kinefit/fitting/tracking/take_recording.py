@@ -373,9 +373,15 @@ def pose_findings_of(take: Take, seen: Observations, body: Body, *, refuse: bool
     ObservationError
         With `refuse`: the sides of a file are wrong.
     """
-    out, entries = list[Finding](), {of.recording.sensor: of for of in seen.sensors}
-    for sensor in (one for one in sensors_of(take, seen, body) if isinstance(one, PoseSensor)):
-        entry, recording = entries[sensor.name].entry, cast(Any, entries[sensor.name].recording)
+    out, poses = list[Finding](), [of for of in seen.sensors if of.kind.table == "pose"]
+    try:
+        sensors = cast(tuple[PoseSensor, ...], sensors_of(take, replace(seen, sensors=tuple(poses)), body))
+    except KinefitError:
+        if refuse:
+            raise
+        return ()  # which the check of the whole take tells
+    for of, sensor in zip(poses, sensors, strict=True):
+        entry, recording = of.entry, cast(Any, of.recording)
         used = [name for name in recording.names if name in sensor.points]
         names = tuple(place if isinstance(place := sensor.points[name], str) else name for name in used)
         points, std = replace(sensor.places(body, used), names=names), sensor.errors.offset + sensor.errors.sigma

@@ -264,7 +264,9 @@ def _sensor(entry: PoseEntry, recording: PoseRecording, body: Body) -> PoseSenso
         apart = [(a, b, recording.x_world[:, at[a]] - recording.x_world[:, at[b]]) for a, b in permutations(points, 2)]
         lengths = {(a, b): float(np.nanmedian(np.linalg.norm(d, axis=1))) for a, b, d in apart}
     errors = PoseErrors(sigma=entry.sigma, root=entry.root_sigma, offset=entry.offset_sigma)
-    return PoseSensor(recording.sensor, points, lengths, errors, camera=entry.camera, up=recording.another)
+    sensor = PoseSensor(recording.sensor, points, lengths, errors, camera=entry.camera, up=recording.another)
+    sensor.places(body, tuple(points))  # raises where the body has none of a name
+    return sensor
 
 
 def _propose(files: Sequence[Path]) -> Iterator[Proposal]:
