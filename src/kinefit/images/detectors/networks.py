@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import FileError, ObservationError
+from kinefit.errors import FileError, ObservationError, extra
 from kinefit.images.detectors.box_detector import DetectedPerson
 from kinefit.images.detectors.layouts import PointLayout
 from kinefit.images.detectors.roi import PersonLandmarks, mean_with_mirrored
@@ -77,7 +77,9 @@ class OnnxNetwork:
     """
 
     def __init__(self, path: Path, threads: int = 1, size: tuple[int, int] | None = None) -> None:
-        self.path, runtime = path, onnx_runtime()
+        with extra("onnx", "ONNX networks are run by the package onnxruntime", ObservationError):
+            import onnxruntime as runtime
+        self.path = path
         if not path.is_file():
             raise FileError("no such network", file=path, remedy="Check its name.")
         with path.open("rb") as file:
@@ -127,16 +129,6 @@ class OnnxNetwork:
     def grey(self, values: CropInput) -> NDArray:
         """An input of a grey image."""
         return values(np.full((self.size[1], self.size[0], 3), 114, np.uint8), self.dtype)
-
-
-def onnx_runtime() -> Any:
-    """The module `onnxruntime`; ObservationError where the extra `onnx` is not installed."""
-    try:
-        import onnxruntime
-    except ImportError as error:
-        problem = f"the runtime of ONNX networks is not installed ({error})"
-        raise ObservationError(problem, remedy="Run: pip install 'kinefit[onnx]'.") from error
-    return onnxruntime
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ class OpenPosePerson(msgspec.Struct):
 
 
 class OpenPoseFrame(msgspec.Struct):
-    """All people of a frame; an empty object is nobody (Pose2Sim's `pose-associated`)."""
+    """All people of a frame; an empty object is no person (Pose2Sim's `pose-associated`)."""
 
     people: list[msgspec.Raw]
 

@@ -17,7 +17,7 @@ from kinefit.readers.landmarks.keypoint_sets import frame_numbers
 from kinefit.readers.landmarks.keypoints import OpenPoseFrame, OpenPosePerson, decoded, people_record, with_new_keys
 from kinefit.readers.plugins import FileFormat
 
-Row = tuple[int, list[float]]  # frame, and x, y [px], confidence of each point of one person; none of nobody
+Row = tuple[int, list[float]]  # frame, and x, y [px], confidence of each point of a person; empty if undetected
 _HALPE, _HALPE_MORE = 3 * 26, (3 * 136, 3 * 68)  # numbers of a person of HALPE_26; with face and hands, with hands
 _VIDEO_IMAGE = re.compile(r"(0|[1-9]\d*)\.\w+")  # name that AlphaPose gives to a frame of a video: "0.jpg"
 _MAX_START_BYTES = 4096  # in which the keys of a form are

@@ -126,7 +126,7 @@ def read_poses(path: Path, *, person: int | None = None) -> _PoseFile:
     FileError
         No such file, another format, or arrays that do not fit together.
     ObservationError
-        Several people of whom none is chosen; what the readers of the formats raise.
+        Several people, none of them chosen; what the readers of the formats raise.
     """
     suffix = path.suffix.lower()
     if suffix in (".trc", ".c3d"):
