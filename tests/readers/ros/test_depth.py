@@ -1,6 +1,8 @@
 """Depth in MCAP of ROS 2, written by rosbags, which shares no code with what reads it."""
 
+import gc
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -85,6 +87,19 @@ def test_damaged_files_are_told(record, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mcap.reader", None)
     with pytest.raises(FileError, match=r"kinefit\[ros\]"):
         read_depth(tmp_path / "a.mcap")
+
+
+def test_a_forgotten_file_is_closed(record):
+    file = record({"/depth": ("16UC1", COUNTS)})
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for _ in range(8):
+            held = [read_depth(file)]
+            gc.collect(0)
+            held.append(held)  # as the frames of an exception that was raised within
+            del held
+            gc.collect()
+    assert not said
 
 
 METRES = (COUNTS * 0.001).astype(np.float32)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import os
 import struct
+import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -183,6 +184,7 @@ class Messages:
         self._path, self._topic, self._logged, self._convert = path, topic, logged, convert
         self._open, self._next = ExitStack(), -1
         self._coming: Iterator[Any] = iter(())
+        weakref.finalize(self, self._open.close)  # in a cycle Python may drop the file before what closes it
 
     def __call__(self, i: int) -> NDArray:
         """Message `i`, decoded and converted.
