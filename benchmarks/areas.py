@@ -171,6 +171,7 @@ AREAS: dict[str, dict[str, str]] = {
         "house_size": "code lines, questions of type, parameters, rooms and class names of the package",
         "house_record": "commands, options, take keys, formats, findings and public names that are lost",
         "house_roads": "functions and types that a measurement passes on its way to a Motion",
+        "first_hour": "README's two commands on a machine that never saw kinefit, and the tests of a change",
         "house_words": "private words, names of constants, docstrings of public functions",
     },
 }
