@@ -180,7 +180,7 @@ def exp(Psi: Multivector) -> Multivector:
     square = Psi * Psi
     half = 0.5 * np.sqrt(np.maximum(-square.scalar, 0.0))
     pitch = -square.along(_EPSILON)  # 2 θ p
-    a, b, c = se3._coefficients(half)
+    (a, b), c = se3._coefficients(half), se3._cubic(half)
     cosine = np.cos(half) - _EPSILON * (0.125 * pitch * a)
     sine = 0.5 * a - _EPSILON * (0.0625 * pitch * (b - c))
     return (cosine - Psi * sine).select(_MOTOR)
@@ -193,7 +193,7 @@ def log(M: Multivector) -> Multivector:
     plane = M.grade(2)
     sine = np.linalg.norm(plane.select(_TURN).values, axis=0)
     half = np.arctan2(sine, M.scalar)
-    a, b, c = se3._coefficients(half)
+    (a, b), c = se3._coefficients(half), se3._cubic(half)
     first, second = 2.0 / a, -2.0 * M.along(_EPSILON) * (b - c) / a**3
     return -(plane * (first + _EPSILON * second)).select((*_TURN, *_SHIFT))
 

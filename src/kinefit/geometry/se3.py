@@ -22,15 +22,16 @@ def _series(theta2: NDArray, first: int) -> NDArray:
     return total
 
 
-def _coefficients(theta: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """sin θ / θ, (1 − cos θ) / θ², (θ − sin θ) / θ³."""
-    theta2 = theta * theta
+def _coefficients(theta: NDArray) -> tuple[NDArray, NDArray]:
+    """sin θ / θ and (1 − cos θ) / θ²."""
+    return np.sinc(theta / np.pi), 0.5 * np.sinc(theta / (2.0 * np.pi)) ** 2
+
+
+def _cubic(theta: NDArray) -> NDArray:
+    """(θ − sin θ) / θ³."""
     small = theta < _MAX_SERIES_ANGLE
     t = np.where(small, 1.0, theta)
-    a = np.where(small, _series(theta2, 1), np.sin(t) / t)
-    b = np.where(small, _series(theta2, 2), 2.0 * (np.sin(0.5 * t) / t) ** 2)
-    c = np.where(small, _series(theta2, 3), (t - np.sin(t)) / t**3)
-    return a, b, c
+    return np.where(small, _series(theta * theta, 3), (t - np.sin(t)) / t**3)
 
 
 def hat(omega: NDArray) -> NDArray:
@@ -46,7 +47,7 @@ def hat(omega: NDArray) -> NDArray:
 def exp_so3(omega: NDArray) -> NDArray:
     """Rotation matrices (N, 3, 3) of rotation vectors (N, 3) [rad], by Rodrigues' formula."""
     omega = np.asarray(omega, float)
-    a, b, _ = _coefficients(np.linalg.norm(omega, axis=-1))
+    a, b = _coefficients(np.linalg.norm(omega, axis=-1))
     w = hat(omega)
     return np.eye(3) + a[..., None, None] * w + b[..., None, None] * (w @ w)
 
@@ -158,14 +159,14 @@ def log(T: NDArray) -> NDArray:
 def left_jacobian_so3(omega: NDArray) -> NDArray:
     """Left Jacobians of SO(3) (N, 3, 3) at ω (N, 3) [rad]: exp(ω + δ) ≈ exp(J δ) exp(ω)."""
     omega = np.asarray(omega, float)
-    _, b, c = _coefficients(np.linalg.norm(omega, axis=-1))
-    w = hat(omega)
+    theta = np.linalg.norm(omega, axis=-1)
+    b, c, w = _coefficients(theta)[1], _cubic(theta), hat(omega)
     return np.eye(3) + b[..., None, None] * w + c[..., None, None] * (w @ w)
 
 
 def _left_so3_inverse(omega: NDArray) -> NDArray:
     theta = np.linalg.norm(omega, axis=-1)
-    _, b, c = _coefficients(theta)
+    b, c = _coefficients(theta)[1], _cubic(theta)
     # 1/θ² − A/(2Bθ²) = (2B − A) / (2Bθ²), and 2B − A = θ² (c − 2e) with e = (½ − B) / θ²
     small = theta < _MAX_SERIES_ANGLE
     e = np.where(small, _series(theta**2, 4), (0.5 - b) / np.where(small, 1.0, theta) ** 2)
