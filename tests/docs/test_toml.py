@@ -19,7 +19,6 @@ from kinefit.readers.take.kinds import BUILT_IN
 
 CAMERA = '[calibration]\nfile = "calibration.toml"\n[[camera]]\nname = "cam01"\nvideo = "cam01.mp4"\n'
 SENSOR = '[[keypoints]]\ncamera = "cam01"\nfile = "cam01.npy"\nformat = "mediapipe"\n'
-GOLF = Path(__file__).parents[2] / "benchmarks" / "accuracy" / "closures" / "golf_swing" / "body.toml"
 SEGMENT = '[body]\nname = "limb"\n[[segment]]\nname = "limb"\njoint = { name = "free", type = "free" }\n'
 BOX = "".join(
     [f"v {x} {y} {z}\n" for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)]
@@ -46,7 +45,6 @@ def whole(text):
         return "body", SEGMENT + text
     if keys <= {"coupling", "dimension", "morph"}:
         base = "snowboarder" if "dimension" in keys else "humanoid"
-        base = str(GOLF) if "club_head" in text else base
         return "body", f'[body]\nname = "changed"\nbase = "{base}"\n{text}'
     if "mapping" in keys:
         return "network", text
