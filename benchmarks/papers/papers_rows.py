@@ -111,7 +111,7 @@ def _state(row: Row, records: Mapping[str, Record]) -> str:
         return f"no figure of its own{missed}"
     found = [records[name] for name in row.figures]
     met = sum(record.verdict == "met" for record in found)
-    return f"{met} of {len(found)} goals met; `{row.figures[0]}` {_cells(found[0])[0]}{missed}"
+    return f"{met} of {len(found)} goals met{missed}"
 
 
 def _cells(record: Record) -> tuple[str, str, str, str]:
