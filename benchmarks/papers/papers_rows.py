@@ -84,7 +84,7 @@ def _row(item: str, title: str, text: str) -> Row:
 
 
 def filled_page(text: str, records: Mapping[str, Record]) -> str:
-    """A page whose rows have tables with value, goal, verdict and date as the log has them."""
+    """A page whose rows have tables with value, goal and verdict as the log has them."""
 
     def line(found: re.Match[str]) -> str:
         return f"| `{found[1]}` | {' | '.join(_cells(records[found[1]]))} |"
@@ -106,7 +106,7 @@ def filled_index(text: str, rows: Iterable[Row], records: Mapping[str, Record]) 
 
 
 def _state(row: Row, records: Mapping[str, Record]) -> str:
-    missed = "; **misses** on its page" if row.misses else ""
+    missed = "; **misses**" if row.misses else ""
     if not row.figures:
         return f"no figure of its own{missed}"
     found = [records[name] for name in row.figures]
@@ -114,9 +114,9 @@ def _state(row: Row, records: Mapping[str, Record]) -> str:
     return f"{met} of {len(found)} goals met{missed}"
 
 
-def _cells(record: Record) -> tuple[str, str, str, str]:
+def _cells(record: Record) -> tuple[str, str, str]:
     value = f"{record.value} {record.unit}".strip() if record.value else "not measured"
-    return value.replace("|", "/"), record.goal, record.verdict.replace("missed", "**missed**"), record.date
+    return value.replace("|", "/"), record.goal, record.verdict.replace("missed", "**missed**")
 
 
 def fill() -> None:
