@@ -35,9 +35,7 @@ def test_pages_and_index_show_what_the_log_says():
     assert filled_index(index, read_rows(TEXTS), records) == index, hint
 
 
-@pytest.mark.parametrize(
-    ("was", "by_hand"), [("| met |", "| **missed** |"), ("% |", "0 % |"), ("| <= ", "| <= 9")]
-)
+@pytest.mark.parametrize(("was", "by_hand"), [("| met |", "| **missed** |"), ("% |", "0 % |"), ("| <= ", "| <= 9")])
 def test_what_is_written_by_hand_is_found(was, by_hand):
     text = next(text for text in TEXTS if was in text)
     assert filled_page(text.replace(was, by_hand, 1), read(LOG)) == text
