@@ -30,6 +30,9 @@ _TOGETHER = 9
 _LONG_UNIT = 22
 """Letters of a unit from which on only its first words are shown."""
 
+_BEFORE_MARK = "†"
+"""Of a value from before the log, as the head of docs/figures.toml says."""
+
 _SIGNS = {"<=": "≤ ", ">=": "≥ ", ">": "> ", "==": ""}
 _UNITS = {"x": "×", "deg": "°"}
 _NO_BREAK = str.maketrans({" ": "\N{NO-BREAK SPACE}", "-": "\N{NON-BREAKING HYPHEN}"})
@@ -150,8 +153,8 @@ def _line(name: str, record: Record | None, newest: date) -> tuple[str, ...]:
     if record is None:
         return shown, "–", "–", "–", "never logged"
     verdict = f"**{record.verdict}**" if record.verdict == "missed" else record.verdict
-    state = ", more than four weeks old" if newest - date.fromisoformat(record.date) > OLD else ""
-    state += f", {BEFORE}" if record.reason == BEFORE else ""
+    state = _BEFORE_MARK if record.reason == BEFORE else ""
+    state += ", more than four weeks old" if newest - date.fromisoformat(record.date) > OLD else ""
     cells = (cell.translate(_NO_BREAK) for cell in (_value(record), _goal(record.goal), verdict))
     return shown, *cells, f"{record.date} {record.commit}{state}"
 

@@ -122,7 +122,6 @@ def depth_fusion(folder):
         frame = KeypointFrame("colour", float(t), k.names, k.points[i, 0], k.confidence[i, 0], k.keypoint_set)
         seen.append((float(t), w.depth.frame(i).depth, frame))
     yield {"body": w.body, "rig": rig, "stream": seen}
-    yield {}
     steps = [[DepthFrame("kinect", t, depth), keypoints] for t, depth, keypoints in seen]
     yield {"kinefit": kinefit, "steps": steps}
 

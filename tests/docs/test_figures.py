@@ -96,7 +96,7 @@ def test_every_figure_has_a_line_of_its_own_in_the_table_of_its_subject(records)
     assert solver[0] == "Simulated, all."
     assert solver[4:7] == [
         "| `new` | – | – | – | never logged |",
-        "| `old` | 2.70°, mean | ≤ 2 | **missed** | 2026-10-20 0c1f146, more than four weeks old, before the log |",
+        "| `old` | 2.70°, mean | ≤ 2 | **missed** | 2026-10-20 0c1f146†, more than four weeks old |",
         "| `speed` | 4.5 ms | ≤ 5 | met | 2026-11-24 abc1234 |",
     ]
     assert solver[8] == "`speed`: of legs"
