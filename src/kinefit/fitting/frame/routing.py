@@ -124,7 +124,7 @@ class Sensors:
             A sensor's `prepare` returns no measurement, or one without its name or without a time.
         """
         out, frames_of = [], dict[str, list[Any]]()
-        routed = [(None if isinstance(f, Measurement) else self._of_frame(f), f) for f in frames]
+        routed = [(None if _is_prepared(f) else self._of_frame(f), f) for f in frames]
         for sensor, frame in routed:
             frames_of.setdefault("" if sensor is None else sensor.name, []).append(frame)
         for sensor, frame in routed:
@@ -288,6 +288,10 @@ class Sensors:
         return SilhouetteSensor(self.rig[name], sigma, self.settings)
 
 
+def _is_prepared(frame: Any) -> bool:
+    return isinstance(frame, Measurement)
+
+
 def _checked(m: Any, sensor: str) -> Measurement:
     remedy = "It must return a Measurement with the name of its `sensor`."
     of_kind(m, Measurement, f"the result of `prepare` of sensor '{sensor}'", remedy)
@@ -318,7 +322,7 @@ def time_of(frames: Sequence[Any], time: float | None, own: Sensors) -> float:
             continue
         if not is_number(getattr(frame, "time", 0.0)):
             raise ObservationError(f"the time of a frame is a {type(frame.time).__name__}", remedy="Give seconds.")
-        if isinstance(frame, Measurement):
+        if _is_prepared(frame):
             continue
         if not isinstance(getattr(frame, "sensor", None), str):
             kinds = ", ".join(kind.__name__ for kind in own._makers)

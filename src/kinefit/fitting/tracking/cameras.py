@@ -26,7 +26,7 @@ from kinefit.fitting.subject.subject import (
 from kinefit.fitting.tracking.recording import Recording, spread
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.observations import DepthFrame
+from kinefit.observations import DepthFrame, by_record
 from kinefit.sensors.alignment import MISFIT_SIGMAS, POSE_SIGMAS, SensorAlignment
 from kinefit.sensors.base import Matched, Measurement, rows_at
 from kinefit.sensors.displaced import Displaced, displacement
@@ -247,8 +247,8 @@ def placed_cameras(recording: Recording, subject: Subject, settings: TrackSettin
     videos = {k.camera for k in recording.keypoints}
     looks: dict[str, list[Look]] = {}
     for k in spread(len(subject.frames), _FRAMES):
-        for frame in recording.steps(subject.frames[k]):
-            if isinstance(frame, DepthFrame) and recording.rig[frame.sensor].name not in videos:
+        for frame in by_record(recording.steps(subject.frames[k]))[DepthFrame]:
+            if recording.rig[frame.sensor].name not in videos:
                 state, samples = subject.fit.states[k], settings.samples
                 scene = Scene(subject.body, state, recording.rig, time=frame.time, samples=samples)
                 looks.setdefault(frame.sensor, []).append(([frame], scene))

@@ -169,21 +169,19 @@ def recording_of(
 def _clicked_on_person(frames: Sequence[Any], i: int, seen: Observations, of_person: Recording) -> Sequence[Any]:
     """Frames of a step without clicks on others: the person with the nearest keypoint in the image was clicked on."""
     who = of_person.followed
-    if who is None or len(who.people) < 2 or not any(isinstance(f, ClickFrame) for f in frames):
+    if who is None or len(who.people) < 2:
         return frames
-    out = []
-    for frame in frames:
-        if isinstance(frame, ClickFrame):
-            uv, distance = frame.ends.mean(axis=1), np.full((len(frame.names), len(who.people)), np.inf)
-            for q, k in enumerate(seen.keypoints):
-                for p, one in enumerate(who.people if k.camera == frame.sensor else ()):
-                    own = k.points[i, one.chosen[q][i]] if one.chosen[q][i] >= 0 else np.full((1, 2), np.inf)
-                    away = np.linalg.norm(uv[:, None] - own, axis=2)
-                    distance[:, p] = np.fmin(distance[:, p], np.fmin.reduce(away, axis=1))
-            on_other = distance[:, who.number - 1] > distance.min(axis=1)
-            frame = replace(frame, ends=np.where(on_other[:, None, None], np.nan, frame.ends))
-        out.append(frame)
-    return out
+    on_person = {}
+    for frame in by_record(frames)[ClickFrame]:
+        uv, distance = frame.ends.mean(axis=1), np.full((len(frame.names), len(who.people)), np.inf)
+        for q, k in enumerate(seen.keypoints):
+            for p, one in enumerate(who.people if k.camera == frame.sensor else ()):
+                own = k.points[i, one.chosen[q][i]] if one.chosen[q][i] >= 0 else np.full((1, 2), np.inf)
+                away = np.linalg.norm(uv[:, None] - own, axis=2)
+                distance[:, p] = np.fmin(distance[:, p], np.fmin.reduce(away, axis=1))
+        on_other = distance[:, who.number - 1] > distance.min(axis=1)
+        on_person[id(frame)] = replace(frame, ends=np.where(on_other[:, None, None], np.nan, frame.ends))
+    return [on_person.get(id(frame), frame) for frame in frames]
 
 
 def with_fitted_start(
