@@ -28,7 +28,7 @@ from kinefit.sensors.scene import Scene
 from kinefit.solving.bundle.border import Bordered, Prior, solve
 from kinefit.solving.bundle.border_frames import MAX_POSE_STEPS, POSTURE_SHARE, Part, Weighing, apart
 from kinefit.solving.equations import inverse
-from kinefit.solving.pixels import PixelPoints
+from kinefit.solving.least_squares import PixelPoints
 from kinefit.solving.rows import AnyRows, Rows
 
 CLOSURES = "closures"

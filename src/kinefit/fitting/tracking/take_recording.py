@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit import observations
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.marker_sets import LANDMARK_SPREAD, MarkerPlacement, bare, find_placement, known_set, matched
 from kinefit.bodies.motion import UP_AXES, Motion
@@ -24,17 +25,6 @@ from kinefit.fitting.tracking.recording import Recording, spread
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
-from kinefit.observations import (
-    KEYPOINT_SIGMA,
-    ClickFrame,
-    DepthFrame,
-    DepthVideo,
-    KeypointVideo,
-    Markers,
-    NamedMarkers,
-    SilhouetteFrame,
-    by_record,
-)
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.cameras import is_level
 from kinefit.readers.take.entries import sensor_name
@@ -117,7 +107,7 @@ def recording_of(
         What the sensors' readers raise; markers of which the body knows none.
     """
     stereo = load_stereo(take, seen)
-    depth: tuple[DepthVideo, ...] = (*seen.depth, *stereo)
+    depth: tuple[observations.DepthVideo, ...] = (*seen.depth, *stereo)
     rig = Rig((*(seen.rig or ()), *(v.camera for v in stereo if v.camera is not None)))
     known = _motion_poses(take, body, seen)
     start = (0, known[0]) if known else posed_start(take, body, seen.frames)
@@ -132,7 +122,7 @@ def recording_of(
             k = video.at_step(first + i, rate)
             if k is not None:
                 out.append(video.frame(k))
-            elif isinstance(video, KeypointVideo):
+            elif isinstance(video, observations.KeypointVideo):
                 out.append(video.unseen(float(times[i])))
         frames = (m.at(float(times[i])) for m in marked)
         return [*out, *(f for f in frames if f is not None)]
@@ -172,7 +162,7 @@ def _clicked_on_person(frames: Sequence[Any], i: int, seen: Observations, of_per
     if who is None or len(who.people) < 2:
         return frames
     on_person = {}
-    for frame in by_record(frames)[ClickFrame]:
+    for frame in observations.by_record(frames)[observations.ClickFrame]:
         uv, distance = frame.ends.mean(axis=1), np.full((len(frame.names), len(who.people)), np.inf)
         for q, k in enumerate(seen.keypoints):
             for p, one in enumerate(who.people if k.camera == frame.sensor else ()):
@@ -191,7 +181,7 @@ def with_fitted_start(
     if recording.start is None:
         return recording
     step, state = recording.start
-    shown = by_record(recording.steps(step))[SilhouetteFrame]
+    shown = observations.by_record(recording.steps(step))[observations.SilhouetteFrame]
     if not shown:
         return recording
     found = coarse_to_fine(
@@ -200,7 +190,7 @@ def with_fitted_start(
     return replace(recording, start=(step, found.result.state))
 
 
-def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict[str, float]:
+def _sigma(take: Take, seen: Observations, stereo: Sequence[observations.DepthVideo]) -> dict[str, float]:
     """Standard deviation of every sensor, [m] or [px]."""
     out = {entry.name: entry.sigma for entry in take.depth}
     out |= {entry.name: stereo_sigma(entry, video, seen) for entry, video in zip(take.stereo, stereo)}
@@ -210,7 +200,7 @@ def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict
     out |= {
         f"{seen_by.camera} {seen_by.keypoint_set}": seen_by.sigma
         for entry, seen_by in zip(take.keypoints, seen.keypoints)
-        if seen_by.sigma is not None and entry.sigma == KEYPOINT_SIGMA
+        if seen_by.sigma is not None and entry.sigma == observations.KEYPOINT_SIGMA
     }  # fmt: skip
     return out | {sensor_name("markers", take.markers, k): entry.sigma for k, entry in enumerate(take.markers)}
 
@@ -299,7 +289,7 @@ def _motion_poses(take: Take, body: Body, seen: Observations) -> dict[int, BodyS
     return {i: BodyState(T, q) for i, (T, q) in enumerate(zip(roots, motion.angles)) if take.size or not i}
 
 
-def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMarkers], Body]:
+def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[observations.NamedMarkers], Body]:
     """All marker recordings by the names of the body's sets; a set of the catalogue is put on the body where needed."""
     out = []
     for k, (entry, markers, trial) in enumerate(zip(take.markers, seen.markers, seen.static_markers, strict=True)):
@@ -308,11 +298,12 @@ def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMark
         if own and own not in body.marker_sets:
             body = replace(body, marker_sets={**body.marker_sets, own: known})
         named, trial = _named_as(markers, known.names), trial and _named_as(trial, known.names)
-        out.append(NamedMarkers(sensor_name("markers", take.markers, k), named, own, entry.time_offset, std, trial))
+        name = sensor_name("markers", take.markers, k)
+        out.append(observations.NamedMarkers(name, named, own, entry.time_offset, std, trial))
     return out, body
 
 
-def _named_as(markers: Markers, known: Sequence[str]) -> Markers:
+def _named_as(markers: observations.Markers, known: Sequence[str]) -> observations.Markers:
     """The markers that a set knows, by its names."""
     names = matched(markers.names, known)
     here = [i for i, (label, name) in enumerate(zip(markers.names, names)) if (name or bare(label)) in known]
@@ -388,7 +379,7 @@ def pose_findings_of(take: Take, seen: Observations, body: Body, *, refuse: bool
             found: tuple[Finding, ...] = ()
             with suppress(KinefitError):  # which tracking raises
                 placed = MarkerPlacement(sensor.name, points, np.full(len(points), std))
-                seen_as = Markers(names, recording.rate, x, up=take.up.strip("-"))
+                seen_as = observations.Markers(names, recording.rate, x, up=take.up.strip("-"))
                 found = label_findings(body, seen_as, placed, sides=entry.sides)
             found = tuple(f for f in found if (f.severity, f.kind) == ("fault", "sides"))
             out += [replace(f, remedy=f.remedy.replace("[[markers]]", "[[pose]]")) for f in found]
@@ -420,7 +411,7 @@ def _set_of(body: Body, labels: Sequence[str], wanted: str | None) -> tuple[str,
     return placed.name, placed.points, placed.spread
 
 
-def _first_depth(depth: Sequence[DepthVideo], seen: Observations) -> dict[int, DepthFrame]:
+def _first_depth(depth: Sequence[observations.DepthVideo], seen: Observations) -> dict[int, observations.DepthFrame]:
     """Some images of the first depth sensor from the beginning of the take, by step."""
     start, stop = seen.frames
     for video in depth:
@@ -431,7 +422,7 @@ def _first_depth(depth: Sequence[DepthVideo], seen: Observations) -> dict[int, D
     return {}
 
 
-def _backgrounds(depth: Sequence[DepthVideo]) -> dict[str, NDArray]:
+def _backgrounds(depth: Sequence[observations.DepthVideo]) -> dict[str, NDArray]:
     """What depth sensors saw of the empty scene."""
     out = {}
     for video in depth:

@@ -23,7 +23,7 @@ from kinefit.sensors.points import views
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.visibility.occlusion import MIN_VISIBLE_CONFIDENCE, Hidden, hidden_points
 from kinefit.solving.correspondences import _kernels
-from kinefit.solving.pixels import PixelPoints
+from kinefit.solving.least_squares import PixelPoints
 from kinefit.solving.rows import AnyRows
 
 Stream = tuple[str, str, tuple[str, ...]]

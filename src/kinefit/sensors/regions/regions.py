@@ -29,8 +29,7 @@ from kinefit.sensors.regions.region_parts import OTHER, SEAM_SPACING_PX, Coloure
 from kinefit.sensors.regions.region_search import Starts
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.solving.correspondences.contours.morphed import morphed_outline_rows
-from kinefit.solving.correspondences.contours.outlines import Rim, outline_rows
+from kinefit.solving.correspondences.contours.outlines import Rim, morphed_outline_rows, outline_rows
 from kinefit.solving.rows import AnyRows
 
 

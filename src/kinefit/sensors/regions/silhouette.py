@@ -22,8 +22,7 @@ from kinefit.sensors.evidence import AGREEMENT_SIGMAS, Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.visibility.occlusion import drawn_together, outside_others
-from kinefit.solving.correspondences.contours.morphed import morphed_outline_rows
-from kinefit.solving.correspondences.contours.outlines import Rim, outline_pairs, outline_rows
+from kinefit.solving.correspondences.contours.outlines import Rim, morphed_outline_rows, outline_pairs, outline_rows
 from kinefit.solving.rows import AnyRows
 
 _MAX_RENDER_SHIFT_PX = 0.5  # of a body since its rendering: half of the offset at which pixels at the contour are read

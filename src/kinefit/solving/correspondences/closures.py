@@ -30,7 +30,7 @@ from kinefit.bodies.parts import has_unknown_gear, with_dimensions
 from kinefit.bodies.tree import Closure
 from kinefit.errors import BodyError, ObservationError, check_choice
 from kinefit.geometry import se3
-from kinefit.solving.correspondences import _kernels_closures, targets
+from kinefit.solving.correspondences import _kernels, targets
 from kinefit.solving.rows import DofRows, PairRows
 
 HARD_SIGMA = 1e-4
@@ -72,7 +72,7 @@ class Closed:
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """Closures of a body as arrays for `_kernels_closures.close`: K closures, m equations."""
+    """Closures of a body as arrays for `_kernels.close`: K closures, m equations."""
 
     segments: NDArray
     rest: NDArray
@@ -138,7 +138,7 @@ def _closed(body: Body, state: BodyState, lines: int) -> tuple[NDArray, NDArray]
     t, tree = _table(body), body.tree
     frames, screws = tree.forward(state.T_world_root, state.angles)
     value, J = np.empty(len(t.owner)), np.zeros((lines, tree.n_dofs))
-    _kernels_closures.close(
+    _kernels.close(
         frames, screws, np.ascontiguousarray(state.T_world_root[:3, 3]), t.segments, t.rest, t.directions, t.first,
         t.rigid, t.turns, tree.dof_parent, tree.last_dof, value, J,
     )  # fmt: skip
