@@ -248,12 +248,10 @@ def posed_start(take: Take, body: Body, frames: tuple[int, int]) -> tuple[int, B
     y, x = np.array(pose.upward or UP_AXES[take.up], float), np.array(pose.forward, float)
     if pose.upward is None:  # upright: forward as far as it is level
         x = x - (x @ y) * y
-    T = np.eye(4)
-    T[:3, 0] = x / np.linalg.norm(x)
-    z = np.cross(T[:3, 0], y)
-    T[:3, 2] = z / np.linalg.norm(z)
-    T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
-    T[:3, 3] = pose.at
+    x = x / np.linalg.norm(x)
+    z = np.cross(x, y)
+    z = z / np.linalg.norm(z)
+    T = se3.transform(np.stack([x, np.cross(z, x), z], axis=1), np.array(pose.at))
     angles = np.array(body.default_state(T).angles)
     for name, value in pose.angles.items():
         if name not in tree.coordinates:
