@@ -10,7 +10,8 @@ from kinefit.rigs.bar.bundle import BarProblem
 from kinefit.rigs.bar.calibrate import calibrate_bar
 from kinefit.rigs.bar.start import epipolar, flat, on_floor, place
 from kinefit.rigs.bar.targets import BarViews, read_centroids, targets_in
-from kinefit.solving.bundle.cameras import CENTRE, COLUMNS, TIME, BundleState, CameraPrior, adjust
+from kinefit.solving.bundle.adjust import BundleState, adjust
+from kinefit.solving.bundle.cameras import CENTRE, COLUMNS, TIME, CameraPrior
 
 LENGTH = 0.9
 

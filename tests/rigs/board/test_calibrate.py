@@ -15,7 +15,8 @@ from kinefit.rigs.board.calibrate import calibrate_board
 from kinefit.rigs.board.detection import Board, BoardView, CameraViews, Finder, fitting_boards, with_dictionary
 from kinefit.rigs.board.extrinsics import calibrate_interiors, place_cameras
 from kinefit.rigs.board.sources import camera_sources, find_boards
-from kinefit.solving.bundle.cameras import COLUMNS, FOCAL, POSE, TIME, BundleState, CameraPrior
+from kinefit.solving.bundle.adjust import BundleState
+from kinefit.solving.bundle.cameras import COLUMNS, FOCAL, POSE, TIME, CameraPrior
 
 CHECKER = Board("checkerboard", (9, 6), 0.05)
 CHARUCO = Board("charuco", (5, 7), 0.06, 0.045, "5X5_100")

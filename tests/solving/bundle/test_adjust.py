@@ -6,17 +6,8 @@ import numpy as np
 from tests.oracle import rig_around
 
 from kinefit.geometry.losses import SQUARED
-from kinefit.solving.bundle.cameras import (
-    CENTRE,
-    COLUMNS,
-    FOCAL,
-    POSE,
-    BundleState,
-    CameraPrior,
-    PointPixels,
-    adjust,
-    camera_jacobian,
-)
+from kinefit.solving.bundle.adjust import BundleState, adjust
+from kinefit.solving.bundle.cameras import CENTRE, COLUMNS, FOCAL, POSE, CameraPrior, PointPixels, camera_jacobian
 from kinefit.solving.bundle.shape import PointProblem
 
 RIG = rig_around((0.0, 0.0, 0.0), cameras=3)

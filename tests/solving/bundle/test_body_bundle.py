@@ -8,17 +8,8 @@ from tests.oracle import posture, rig_around
 
 from kinefit.bodies import BodyState, load_body
 from kinefit.geometry.losses import geman_mcclure
-from kinefit.solving.bundle.cameras import (
-    COLUMNS,
-    FOCAL,
-    TIME,
-    BundleState,
-    CameraPrior,
-    PointPixels,
-    adjust,
-    departure,
-    moved_rig,
-)
+from kinefit.solving.bundle.adjust import BundleState, adjust
+from kinefit.solving.bundle.cameras import COLUMNS, FOCAL, TIME, CameraPrior, PointPixels, departure, moved_rig
 from kinefit.solving.bundle.shape import BodyProblem, PixelFrames, shape_parameters
 
 BODY = load_body("humanoid")

@@ -6,14 +6,13 @@ from tests.oracle import rig_around
 
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.losses import SQUARED
+from kinefit.solving.bundle.adjust import BundleState, adjust
 from kinefit.solving.bundle.cameras import (
     COLUMNS,
     FOCAL,
     TIME,
-    BundleState,
     CameraPrior,
     PointPixels,
-    adjust,
     camera_jacobian,
     departure,
     moved_camera,

@@ -19,21 +19,9 @@ from numpy.typing import NDArray
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.losses import huber
 from kinefit.rigs.bar.start import with_focal
+from kinefit.solving.bundle.adjust import Bundle, BundleProblem, BundleState, adjust
 from kinefit.solving.bundle.arrow import Arrow, assembled
-from kinefit.solving.bundle.cameras import (
-    ASPECT,
-    CENTRE,
-    COLUMNS,
-    DISTORTION,
-    FOCAL,
-    POSE,
-    Bundle,
-    BundleProblem,
-    BundleState,
-    CameraPrior,
-    adjust,
-    pixel_rows,
-)
+from kinefit.solving.bundle.cameras import ASPECT, CENTRE, COLUMNS, DISTORTION, FOCAL, POSE, CameraPrior, pixel_rows
 
 INTERIOR = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 _CENTRE_SIGMA = 0.05  # of the image's width, of the principal point about the image's centre

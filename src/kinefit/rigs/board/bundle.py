@@ -18,21 +18,9 @@ from numpy.typing import NDArray
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.losses import huber
+from kinefit.solving.bundle.adjust import Bundle, BundleProblem, BundleState, adjust
 from kinefit.solving.bundle.arrow import Arrow, assembled
-from kinefit.solving.bundle.cameras import (
-    ASPECT,
-    CENTRE,
-    COLUMNS,
-    DISTORTION,
-    FOCAL,
-    POSE,
-    Bundle,
-    BundleProblem,
-    BundleState,
-    CameraPrior,
-    adjust,
-    pixel_rows,
-)
+from kinefit.solving.bundle.cameras import ASPECT, CENTRE, COLUMNS, DISTORTION, FOCAL, POSE, CameraPrior, pixel_rows
 
 _LOSS = huber(1.345)  # 95 % efficient for normal errors (Huber, 1981)
 _CORNER_SIGMA_PX = 0.25  # along one axis, in sharp to slightly blurred images

@@ -30,7 +30,8 @@ from kinefit.rigs.refine.gauge import resized
 from kinefit.rigs.refine.refine import Length, check_input, length_of, prior_sigma, refine_from
 from kinefit.rigs.refine.result import PersonSighting, PersonTrial, Progress, Refinement
 from kinefit.sensors.channels import Channels, make_channels
-from kinefit.solving.bundle.cameras import FOCAL, TIME, BundleState, CameraPrior, PointPixels, adjust
+from kinefit.solving.bundle.adjust import BundleState, adjust
+from kinefit.solving.bundle.cameras import FOCAL, TIME, CameraPrior, PointPixels
 from kinefit.solving.bundle.shape import PointProblem
 
 _MIN_COMMON_KEYPOINTS = 50  # keypoints that two cameras must have in common

@@ -16,18 +16,8 @@ from kinefit.geometry.lines import triangulate
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.rigs.refine import result
 from kinefit.rigs.refine.gauge import aligned, resized
-from kinefit.solving.bundle.cameras import (
-    COLUMNS,
-    FOCAL,
-    POSE,
-    RADIAL,
-    TIME,
-    BundleState,
-    CameraPrior,
-    PointPixels,
-    adjust,
-    departure,
-)
+from kinefit.solving.bundle.adjust import BundleState, adjust
+from kinefit.solving.bundle.cameras import COLUMNS, FOCAL, POSE, RADIAL, TIME, CameraPrior, PointPixels, departure
 from kinefit.solving.bundle.shape import BodyProblem
 
 PLACE_SIGMA = 0.05

@@ -23,17 +23,8 @@ from kinefit.geometry.camera import Rig
 from kinefit.observations import Keypoints
 from kinefit.rigs.refine.gauge import aligned, covariance_in_gauge
 from kinefit.sensors.channels import Channels, make_channels
-from kinefit.solving.bundle.cameras import (
-    COLUMNS,
-    FOCAL,
-    TIME,
-    Bundle,
-    BundleState,
-    PointPixels,
-    adjust,
-    camera_jacobian,
-    departure,
-)
+from kinefit.solving.bundle.adjust import Bundle, BundleState, adjust
+from kinefit.solving.bundle.cameras import COLUMNS, FOCAL, TIME, PointPixels, camera_jacobian, departure
 from kinefit.solving.bundle.shape import PROPORTIONS, BodyProblem, PixelFrames, ShapeParameters, shape_parameters
 
 Progress = Callable[[str, int, int], None]

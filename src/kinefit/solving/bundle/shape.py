@@ -16,9 +16,10 @@ from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.losses import Loss, geman_mcclure
 from kinefit.solving.bundle import _kernels
+from kinefit.solving.bundle.adjust import BundleProblem, BundleState
 from kinefit.solving.bundle.arrow import Arrow, Blocks, assembled
 from kinefit.solving.bundle.border_frames import POSTURE_SHARE
-from kinefit.solving.bundle.cameras import BundleProblem, BundleState, CameraPrior, PointPixels, pixel_rows
+from kinefit.solving.bundle.cameras import CameraPrior, PointPixels, pixel_rows
 from kinefit.solving.equations import block_diagonal
 
 _MIDLINE_STD = 0.002  # [m] of a midline point to either side
