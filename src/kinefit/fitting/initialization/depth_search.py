@@ -30,7 +30,6 @@ LIMB_TRIES = 200  # random poses of a limb in the refinement
 ROUGH_LIMB_TRIES = 100  # the same for each candidate of the trunk
 LIMB_CANDIDATES = 3  # of each kind, random and reaching, that are refined
 REACHING_STARTS = 3  # random poses of a limb for each end of the surface that it is to reach
-_MIN_HORIZONTAL = 1e-3  # part of a line of sight that tells a heading: less is a view from above
 _MIN_LIMB_PIXELS = 4  # of a visible limb
 _MIN_UNEXPLAINED = 0.01  # of a person's pixels for a limb's end: a hand has 2 %
 STEP_SIGMAS = (0.04, 0.2, 0.35)  # [m, rad, rad] initial random steps of the root's position and rotation, and of angles
@@ -39,7 +38,7 @@ STEP_SIGMAS = (0.04, 0.2, 0.35)  # [m, rad, rad] initial random steps of the roo
 def towards(sight: NDArray, up: NDArray) -> NDArray:
     """(3,) horizontal unit vector against a line of sight (3,): towards the sensor, any if it looks along `up` (3,)."""
     forward = (sight @ up) * up - sight
-    if np.linalg.norm(forward) < _MIN_HORIZONTAL:
+    if np.linalg.norm(forward) < 1e-3:  # seen from above
         forward = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     return np.asarray(forward / np.linalg.norm(forward))
 
