@@ -96,7 +96,7 @@ ENDINGS = {
     "kinefit.sensors.kinds.surface_points:read_surface_points": ("a.csv", "a.npz"),
     "kinefit.readers.landmarks.annotations:read_clicks": ("a.json",),
     "kinefit.readers.landmarks.keypoints:read_caliscope_csv": ("a.csv",),
-    "kinefit.sensors.kinds.trackers:read_body_trackers": ("a.csv",),
+    "kinefit.sensors.kinds.poses:read_body_trackers": ("a.csv",),
     "kinefit.readers.landmarks.annotations:read_static_points": ("a.toml",),
     "kinefit.sensors.kinds.lines:read_lines": ("a.csv", "a.json"),
     "kinefit.readers.landmarks.detections:read_detections": ("a.npz",),

@@ -11,8 +11,7 @@ from kinefit.fitting.frame.prediction import prediction_row
 from kinefit.geometry.losses import SQUARED, geman_mcclure, huber
 from kinefit.simulation import squat_and_wave, studio_rig
 from kinefit.solving.correspondences.points import pixel_rows, prior_rows
-from kinefit.solving.least_squares import levenberg_marquardt
-from kinefit.solving.pixels import INITIAL_DAMPING, PixelPoints, fit_pixels
+from kinefit.solving.least_squares import INITIAL_DAMPING, PixelPoints, fit_pixels, levenberg_marquardt
 
 BODY = load_body("humanoid")
 RIG = studio_rig(squat_and_wave())

@@ -137,7 +137,7 @@ def _size(body: Any) -> None:
     from dataclasses import replace
 
     from kinefit.bodies.surfaces import TaperedCylinder
-    from kinefit.fitting.subject.depth import fit_surfaces
+    from kinefit.fitting.subject.surfaces import fit_surfaces
     from kinefit.sensors.surfaces.depth_view import view_of
     from kinefit.simulation.rendering.sensors import KINECT
 

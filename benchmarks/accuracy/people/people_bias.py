@@ -28,8 +28,7 @@ from kinefit import (
     track,
 )
 from kinefit.errors import AssetError, ObservationError
-from kinefit.fitting.subject.keypoints import fit_subject
-from kinefit.fitting.subject.view_bias import SeenFrames, learn_view_bias
+from kinefit.fitting.subject.keypoints import SeenFrames, fit_subject, learn_view_bias
 from kinefit.fitting.tracking.sizing import channels_of
 from kinefit.observations import MEDIAPIPE_33
 from kinefit.readers.landmarks.keypoints import read_caliscope_csv

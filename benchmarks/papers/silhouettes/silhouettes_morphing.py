@@ -22,8 +22,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.geometry.losses import geman_mcclure
 from kinefit.images.silhouette import outline
-from kinefit.solving.correspondences.contours.morphed import morphed_outline_rows
-from kinefit.solving.correspondences.contours.outlines import RimFinder, outline_pairs
+from kinefit.solving.correspondences.contours.outlines import RimFinder, morphed_outline_rows, outline_pairs
 from kinefit.solving.least_squares import gauss_newton
 
 FRAMES, SIZE, FOCAL = 200, (640, 480), 560.0

@@ -153,7 +153,7 @@ def _tracker_table(path: Path) -> None:
 
 
 def _trackers(folder: Path) -> Seed:
-    from kinefit.sensors.kinds.trackers import read_body_trackers
+    from kinefit.sensors.kinds.poses import read_body_trackers
 
     _tracker_table(folder / "trackers.csv")
 

@@ -402,7 +402,7 @@ def sensor_of(frame: object) -> str:
 
 
 def by_record(frames: Iterable[Any]) -> Mapping[type, list[Any]]:
-    """Frames of one time by class: `by_record(frames)[DepthFrame]`; an empty list for a class without frames."""
+    """Frames or measurements of one time by class: `by_record(frames)[DepthFrame]`; empty lists for other classes."""
     out = defaultdict[type, list[Any]](list)
     for frame in frames:
         out[type(frame)].append(frame)

@@ -210,13 +210,14 @@ class Keypoints:
         if self.points.shape[1] == 0:
             shape = len(self), 1, len(self.names)
             return replace(self, points=np.full((*shape, 2), np.nan), confidence=np.zeros(shape), lifted=None)
-        frames, person, present = np.arange(len(self)), np.maximum(chosen, 0), (chosen >= 0)[:, None]
-        points = np.where(present[..., None], self.points[frames, person], np.nan)
-        confidence = np.where(present, self.confidence[frames, person], 0.0)
-        lifted = None
-        if self.lifted is not None:
-            lifted = np.where(present[..., None], self.lifted[frames, person], np.nan)[:, None]
-        return replace(self, points=points[:, None], confidence=confidence[:, None], lifted=lifted)
+        frames, person = np.arange(len(self)), np.maximum(chosen, 0)
+
+        def own(values: NDArray) -> NDArray:
+            out = values[frames, person][:, None]
+            out[chosen < 0] = 0.0 if values is self.confidence else np.nan
+            return out
+
+        return self._changed(own)
 
     @property
     def times(self) -> NDArray:

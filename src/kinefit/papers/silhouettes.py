@@ -24,8 +24,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.lines import perpendiculars
 from kinefit.images.silhouette import colour_silhouette
-from kinefit.solving.correspondences.contours.morphed import morphed_rows
-from kinefit.solving.correspondences.contours.outlines import RimFinder, outline_pairs
+from kinefit.solving.correspondences.contours.outlines import RimFinder, morphed_rows, outline_pairs
 from kinefit.solving.least_squares import gauss_newton
 from kinefit.solving.rows import DofRows, Rows
 

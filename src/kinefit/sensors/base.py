@@ -29,7 +29,7 @@ from kinefit.sensors import _kernels
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.scene import Scene, Unknown
 from kinefit.sensors.surfaces.depth_view import DepthSeen, DepthView
-from kinefit.solving.pixels import PixelPoints
+from kinefit.solving.least_squares import PixelPoints
 from kinefit.solving.rows import AnyRows, DofRows, PairRows, ParameterRows, Rows, less_sure
 
 

@@ -15,7 +15,7 @@ from kinefit.bodies.morphs.morphing import MorphedPose, Morphing
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.sensors.visibility.visibility import TrackedSurface
 from kinefit.solving.correspondences import targets
-from kinefit.solving.correspondences.contours.morphed import on_moved_joints
+from kinefit.solving.correspondences.contours.outlines import on_moved_joints
 from kinefit.solving.rows import DofRows, Rows
 
 SURFACE_SAMPLES = 600  # points of a body's surface that are compared with depth images

@@ -279,13 +279,12 @@ def closure_forces(
     held[[6 + tree.coordinate(name) for name in active]] = True
     held[:6] = not tree.root_free
     A = closed_at(body, state).jacobian
-    U, s, Vt = np.linalg.svd(A[:, ~held].T)
-    rank = int(np.sum(s > _MIN_SINGULAR_RATIO * max(float(s.max(initial=0.0)), 1e-12)))
-    force = -Vt[:rank].T @ ((U[:, :rank].T @ load[~held]) / s[:rank])
+    null = null_space(A[:, ~held].T, load[~held], np.zeros(len(A), bool))
+    force, idle = null.back, null.free.T
     balance = load + A.T @ force
     names = [f"{c.name} {row}" for c in body.closures for row in c.row_names]
     joints = {name: 6 + tree.coordinate(name) for name in active}
-    among = np.concatenate([Vt[rank:], Vt[rank:] @ A[:, list(joints.values())]], axis=1)  # in balance without a load
+    among = np.concatenate([idle, idle @ A[:, list(joints.values())]], axis=1)  # in balance without a load
     free = [k for k, size in zip((*names, *joints), np.abs(among).max(axis=0, initial=0.0)) if size > _MIN_SELF_STRESS]
     off = ~held & (np.abs(balance) > _MAX_UNBALANCED * np.abs(load).max())
     unsupported = tuple(name for k, name in enumerate(tree.coordinates) if off[6 + k])

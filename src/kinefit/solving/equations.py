@@ -14,7 +14,7 @@ from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError
 from kinefit.geometry.losses import SQUARED, Loss
-from kinefit.solving import _kernels, _kernels_border, _kernels_linear
+from kinefit.solving import _kernels, _kernels_linear
 from kinefit.solving.rows import AnyRows, DofRows, ParameterRows, Rows, sort_out
 
 _MIN_INFORMATION_RATIO = 1e-14  # to the most informed degree of freedom: information below it is rounding
@@ -241,7 +241,7 @@ def design(body: Body, state: BodyState, rows: AnyRows) -> NDArray:
     def along(segment: NDArray, data: NDArray) -> NDArray:
         check_indices("segment", len(tree.segments), body, segment)
         out = np.empty((len(segment), tree.n_dofs))
-        _kernels_border.along(data, segment, centre, screws, tree.dof_parent, tree.last_dof, out)
+        _kernels_linear.along(data, segment, centre, screws, tree.dof_parent, tree.last_dof, out)
         return out
 
     if isinstance(rows, Rows):

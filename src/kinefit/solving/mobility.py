@@ -15,7 +15,6 @@ pedal. With g of (9), closures included, it does not.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import BodyError
 from kinefit.solving.closed import CLOSED, null_space, onto
-from kinefit.solving.correspondences.closures import closed_at, owners
+from kinefit.solving.correspondences.closures import closed_at, every_equation, owners
 from kinefit.solving.correspondences.points import prior_rows
 from kinefit.solving.equations import lock
 from kinefit.solving.least_squares import levenberg_marquardt
@@ -212,20 +211,12 @@ def _closed(body: Body, start: BodyState) -> tuple[BodyState, float]:
         body, start, lambda state: [*rows(state), prior_rows(body, state)], max_iterations=60, tolerance=1e-6
     )
     near = levenberg_marquardt(body, near.state, rows, max_iterations=60, tolerance=1e-8)
-    return onto(body, near.state, _equations(body))
-
-
-def _equations(body: Body) -> Callable[[BodyState], tuple[NDArray, NDArray]]:
-    def equations(state: BodyState) -> tuple[NDArray, NDArray]:
-        closed = closed_at(body, state)
-        return closed.value, closed.jacobian
-
-    return equations
+    return onto(body, near.state, every_equation(body))
 
 
 def _finite(body: Body, state: BodyState, fixed: NDArray) -> int:
     """Number of directions in which a closed pose moves by a finite step and can be closed again."""
-    equations = _equations(body)
+    equations = every_equation(body)
     c, A = equations(state)
     free = null_space(A, c, fixed).free
     moved = np.zeros_like(free)

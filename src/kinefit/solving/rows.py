@@ -240,18 +240,19 @@ _Same = TypeVar("_Same", bound=AnyRows)
 
 def weaker(rows: _Same, factor: float) -> _Same:
     """Rows with standard deviations multiplied by a factor (a number above 0)."""
-    return rows if factor == 1.0 else _weighted(rows, rows.weight / factor**2)
+    return rows if factor == 1.0 else weighted(rows, rows.weight / factor**2)
 
 
 def less_sure(rows: AnyRows, variance: NDArray) -> AnyRows:
     """Rows with (N,) [m²] added to the variance of each."""
     W = rows.weight
     if W.ndim == 1:
-        return _weighted(rows, W / (1.0 + W * variance))
-    return _weighted(rows, np.linalg.solve(np.eye(len(W)) + W * variance, W))
+        return weighted(rows, W / (1.0 + W * variance))
+    return weighted(rows, np.linalg.solve(np.eye(len(W)) + W * variance, W))
 
 
-def _weighted(rows: _Same, weight: NDArray) -> _Same:
+def weighted(rows: _Same, weight: NDArray) -> _Same:
+    """Rows with other weights (N,), or (N, N) if they are weighed together."""
     if isinstance(rows, Rows):
         return replace(rows, data=np.concatenate([rows.data[:7], weight[None]]))
     return replace(rows, weight=weight)

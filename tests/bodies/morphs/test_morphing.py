@@ -11,7 +11,7 @@ from kinefit.bodies.surfaces import BodyMesh, SkinnedMesh
 from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry import cga, lines, se3
-from kinefit.solving.correspondences.contours.morphed import morphed_rows
+from kinefit.solving.correspondences.contours.outlines import morphed_rows
 from kinefit.solving.least_squares import gauss_newton
 
 random = np.random.default_rng(0)

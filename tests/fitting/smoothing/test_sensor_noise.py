@@ -36,7 +36,7 @@ def tracked():
     x[rng.uniform(size=x.shape[:2]) < 0.2] = np.nan
     steps = [[MarkerFrame("mocap", i / 20.0, points.names, x[i], "HANIM_45")] for i in range(len(truth))]
     recording = Recording.of_frames(steps, Rig(()), rate=20.0)
-    frames = run(recording, truth.body, TrackSettings(), start=(0, truth.state(0)))
+    frames = run(replace(recording, start=(0, truth.state(0))), truth.body, TrackSettings())
     take = as_tracked(frames)
     assert take.others is None
     rows = replace(frames, scale={"mocap": 1.0}, points=np.zeros(len(truth)))

@@ -9,8 +9,7 @@ from tests.fitting.tracking.depth_oracle import ARMS, BODY, camera, depth_of, fa
 from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.bodies.surfaces.places import nearest
 from kinefit.errors import BodyError, ObservationError
-from kinefit.fitting.subject.depth import fit_surfaces
-from kinefit.fitting.subject.surfaces import GIRTH_STD
+from kinefit.fitting.subject.surfaces import GIRTH_STD, fit_surfaces
 from kinefit.sensors.surfaces.depth_view import view_of
 
 CAMERA = camera()

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from kinefit.bodies import load_body
-from kinefit.fitting.subject.keypoints import fit_subject
-from kinefit.fitting.subject.view_bias import SeenFrames, learn_view_bias
+from kinefit.fitting.subject.keypoints import SeenFrames, fit_subject, learn_view_bias
 from kinefit.sensors.channels import make_channels
 from kinefit.sensors.points.keypoints import Layout
 from kinefit.sensors.points.views import MIRRORED, TERMS, ViewBias

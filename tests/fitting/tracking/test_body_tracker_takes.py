@@ -12,7 +12,7 @@ from kinefit.errors import FileError, KinefitError, ObservationError
 from kinefit.geometry import se3
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
-from kinefit.sensors.kinds.trackers import read_body_trackers
+from kinefit.sensors.kinds.poses import read_body_trackers
 from kinefit.sensors.points.body_trackers import BodyTrackerSensor
 from kinefit.simulation.retarget import known_motion
 from kinefit.takes.check import check_take

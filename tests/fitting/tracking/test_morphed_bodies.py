@@ -21,7 +21,7 @@ from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solving.bundle.border_frames import differences
-from kinefit.solving.correspondences.contours.morphed import on_moved_joints
+from kinefit.solving.correspondences.contours.outlines import on_moved_joints
 from kinefit.solving.rows import DofRows
 
 JOINTS = ("arm_flex_r", "arm_add_r", "arm_flex_l", "elbow_flex_r")

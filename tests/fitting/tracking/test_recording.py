@@ -82,3 +82,12 @@ def test_a_time_that_is_not_the_frames_is_told_and_does_no_harm(frame):
         tracker.update([frame(1)], 1000.0)
     np.testing.assert_array_equal(tracker.state.angles, before.state.angles)
     assert tracker.update([frame(1)], 1 / RATE).time == pytest.approx(1 / RATE)
+
+
+def test_a_part_has_the_start_and_the_poses_of_its_steps():
+    state = BODY.default_state()
+    whole = Recording(np.arange(300) / RATE, RATE, Rig(()), start=(250, state), poses={10: state, 250: state})
+    part = whole.part(slice(200, 300))
+    assert part.start == (50, state)
+    assert dict(part.poses) == {50: state}
+    assert whole.part(slice(0, 100)).start is None

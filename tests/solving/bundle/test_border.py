@@ -10,7 +10,7 @@ from tests.oracle import posture
 from kinefit.bodies import BodyState, load_body
 from kinefit.errors import ObservationError
 from kinefit.geometry.losses import SQUARED, huber
-from kinefit.solving import _kernels_border
+from kinefit.solving import _kernels_linear
 from kinefit.solving.bundle.border import Prior, solve
 from kinefit.solving.bundle.border_frames import MAX_POSE_STEPS, Weighing
 from kinefit.solving.correspondences import _kernels, prior_rows, targets
@@ -152,5 +152,5 @@ def test_rows_of_every_kind_have_their_columns():
 def test_small_sums():
     random = np.random.default_rng(0)
     A, B, H = random.normal(size=(30, 6)), random.normal(size=(30, 4)), np.ones((6, 4))
-    _kernels_border.gram(A, B, H)
+    _kernels_linear.gram(A, B, H)
     assert np.allclose(H, 1.0 + A.T @ B)

@@ -11,7 +11,7 @@ from kinefit.bodies.parts import known_gear
 from kinefit.errors import BodyError
 from kinefit.geometry import se3
 from kinefit.solving.closed import onto
-from kinefit.solving.correspondences import _kernels_closures as kernels
+from kinefit.solving.correspondences import _kernels as kernels
 from kinefit.solving.correspondences import point_rows
 from kinefit.solving.correspondences.closures import (
     HARD_SIGMA,

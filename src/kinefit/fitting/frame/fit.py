@@ -24,8 +24,7 @@ from kinefit.solving.correspondences.closures import HARD_SIGMA, closed_at, hard
 from kinefit.solving.correspondences.occupancy.free_space import CollisionPairs, collision_pairs, collision_rows
 from kinefit.solving.correspondences.points import prior_rows
 from kinefit.solving.equations import inverse, joint_moves, normal_equations
-from kinefit.solving.least_squares import gauss_newton, levenberg_marquardt
-from kinefit.solving.pixels import INITIAL_DAMPING, fit_pixels
+from kinefit.solving.least_squares import INITIAL_DAMPING, fit_pixels, gauss_newton, levenberg_marquardt
 from kinefit.solving.rows import AnyRows, DofRows, Rows, weaker
 
 _MAX_CLOSURE_ERROR = 0.01  # [m, rad] of a start; above it a first fit closes chains with this standard deviation

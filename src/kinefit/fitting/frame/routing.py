@@ -8,23 +8,12 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit import observations
 from kinefit._records import restore_state, save_state
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.losses import SQUARED
-from kinefit.observations import (
-    KEYPOINTS,
-    ClickFrame,
-    ColourFrame,
-    DepthFrame,
-    KeypointFrame,
-    LiftedFrame,
-    LineFrame,
-    MarkerFrame,
-    PointCloud,
-    SilhouetteFrame,
-    sensor_of,
-)
+from kinefit.observations import KEYPOINTS
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Matched, Measurement, Sensor, named, of_kind, rows_at
 from kinefit.sensors.channels import ChannelNames
@@ -98,9 +87,11 @@ class Sensors:
         self._made_of: dict[str, tuple[str, str]] = {}  # {built-in sensor: kind and sensor name of its frames}
         self._channels = ChannelNames()
         self._makers: dict[type, Callable[[str], Sensor]] = {
-            KeypointFrame: self._keypoints, MarkerFrame: self._markers, DepthFrame: self._depth,
-            PointCloud: self._cloud, SilhouetteFrame: self._silhouette, LineFrame: self._lines,
-            ClickFrame: self._clicks, ColourFrame: self._region, LiftedFrame: self._lifted,
+            observations.KeypointFrame: self._keypoints, observations.MarkerFrame: self._markers,
+            observations.DepthFrame: self._depth, observations.PointCloud: self._cloud,
+            observations.SilhouetteFrame: self._silhouette, observations.LineFrame: self._lines,
+            observations.ClickFrame: self._clicks, observations.ColourFrame: self._region,
+            observations.LiftedFrame: self._lifted,
         }  # fmt: skip
 
     def __iter__(self) -> Any:
@@ -124,7 +115,7 @@ class Sensors:
             A sensor's `prepare` returns no measurement, or one without its name or without a time.
         """
         out, frames_of = [], dict[str, list[Any]]()
-        routed = [(None if isinstance(f, Measurement) else self._of_frame(f), f) for f in frames]
+        routed = [(None if _is_prepared(f) else self._of_frame(f), f) for f in frames]
         for sensor, frame in routed:
             frames_of.setdefault("" if sensor is None else sensor.name, []).append(frame)
         for sensor, frame in routed:
@@ -171,7 +162,8 @@ class Sensors:
         if name in self._own:
             raise ObservationError(f"'{name}' is a custom sensor", remedy="Change sigma in the sensor itself.")
         self.sigma[name] = float(sigma)
-        for sensor in (KEYPOINTS, name):  # made again for its next frame; a camera's learnt background stays
+        # made again for its next frame; a camera's learnt background stays
+        for sensor in (KEYPOINTS, name):
             self._sensors.pop(sensor, None)
 
     def learnt(self) -> list[dict[str, Any]]:
@@ -187,7 +179,7 @@ class Sensors:
     @property
     def keypoints(self) -> KeypointSensor:
         """The sensor of the keypoint detectors of all cameras."""
-        return cast(KeypointSensor, self._made(KEYPOINTS, KeypointFrame, KEYPOINTS))
+        return cast(KeypointSensor, self._made(KEYPOINTS, observations.KeypointFrame, KEYPOINTS))
 
     def background(self, camera: Camera) -> Background | None:
         """Background of a depth camera; None where none is to be learnt."""
@@ -243,7 +235,7 @@ class Sensors:
 
     def _of_frame(self, frame: Any) -> Sensor:
         own = self._sensors[frame.sensor] if frame.sensor in self._own else None
-        return own or self._made(sensor_of(frame), type(frame), frame.sensor)
+        return own or self._made(observations.sensor_of(frame), type(frame), frame.sensor)
 
     def _made(self, name: str, kind: type, of: str) -> Sensor:
         """The built-in sensor of a name, made on first use."""
@@ -288,6 +280,10 @@ class Sensors:
         return SilhouetteSensor(self.rig[name], sigma, self.settings)
 
 
+def _is_prepared(frame: Any) -> bool:
+    return isinstance(frame, Measurement)
+
+
 def _checked(m: Any, sensor: str) -> Measurement:
     remedy = "It must return a Measurement with the name of its `sensor`."
     of_kind(m, Measurement, f"the result of `prepare` of sensor '{sensor}'", remedy)
@@ -318,7 +314,7 @@ def time_of(frames: Sequence[Any], time: float | None, own: Sensors) -> float:
             continue
         if not is_number(getattr(frame, "time", 0.0)):
             raise ObservationError(f"the time of a frame is a {type(frame.time).__name__}", remedy="Give seconds.")
-        if isinstance(frame, Measurement):
+        if _is_prepared(frame):
             continue
         if not isinstance(getattr(frame, "sensor", None), str):
             kinds = ", ".join(kind.__name__ for kind in own._makers)

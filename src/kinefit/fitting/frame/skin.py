@@ -30,7 +30,7 @@ from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.sensors.base import Matched
 from kinefit.sensors.scene import Scene
 from kinefit.solving import _kernels
-from kinefit.solving.correspondences.contours.morphed import on_moved_joints
+from kinefit.solving.correspondences.contours.outlines import on_moved_joints
 from kinefit.solving.equations import robust_factors
 from kinefit.solving.rows import AnyRows, DofRows, Rows
 

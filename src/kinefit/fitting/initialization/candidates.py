@@ -21,9 +21,10 @@ from kinefit.errors import KinefitError, ObservationError, TrackingError
 from kinefit.fitting.frame.fit import FrameFit
 from kinefit.fitting.frame.results import FrameResult
 from kinefit.fitting.frame.routing import Sensors
-from kinefit.fitting.initialization.depth_search import PostureSearch
+from kinefit.fitting.initialization.depth_search import PostureSearch, towards
 from kinefit.fitting.initialization.from_depth import Start, StartSearch, starts_by_attempt
 from kinefit.fitting.initialization.from_points import pose_from_points
+from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import DepthFrame, PointCloud, SilhouetteFrame, by_record
 from kinefit.sensors.base import Measurement
@@ -199,23 +200,18 @@ def starts_from_rays(
 
     fits = []
     for heading in _headings(axis, up):
-        T = np.eye(4)
-        T[:3, :3] = np.stack([heading, up, np.cross(heading, up)], axis=1)
-        x = rest @ T[:3, :3].T
+        R = np.stack([heading, up, np.cross(heading, up)], axis=1)
+        x = rest @ R.T
         across = (x - x.mean(axis=0)) @ (np.eye(3) - np.outer(axis, axis))
         distance = np.sqrt(np.mean(np.sum(np.square(across), axis=1))) / max(angle, 1e-6)
-        T[:3, 3] = origin.mean(axis=0) + distance * axis - x.mean(axis=0)
-        start = body.default_state(T)
+        start = body.default_state(se3.transform(R, origin.mean(axis=0) + distance * axis - x.mean(axis=0)))
         fits.append(levenberg_marquardt(body, start, rows, max_iterations=_MAX_ITERATIONS, tolerance=_TOLERANCE))
     return [fit.state for fit in sorted(fits, key=lambda fit: fit.equations.cost)]
 
 
 def _headings(axis: NDArray, up: NDArray) -> list[NDArray]:
     """(3,) horizontal unit vectors, the first towards the camera."""
-    forward = (axis @ up) * up - axis
-    if np.linalg.norm(forward) < 1e-6:  # seen from above
-        forward = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    forward /= np.linalg.norm(forward)
+    forward = towards(axis, up)
     side = np.cross(up, forward)
     return [np.cos(a) * forward + np.sin(a) * side for a in 2.0 * np.pi * np.arange(_HEADING_COUNT) / _HEADING_COUNT]
 

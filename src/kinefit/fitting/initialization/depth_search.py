@@ -13,6 +13,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.bodies.limbs import knuckles, limbs
 from kinefit.fitting.initialization._kernels_reach import reach_for
 from kinefit.fitting.initialization.depth_score import MAX_DEPTH_ERROR, Score, prior_sigmas
+from kinefit.geometry import se3
 from kinefit.geometry.losses import geman_mcclure
 from kinefit.sensors.surfaces.depth_view import DepthView, geodesic_ends
 from kinefit.solving.correspondences import prior_rows, surface_rows
@@ -32,6 +33,14 @@ REACHING_STARTS = 3  # random poses of a limb for each end of the surface that i
 _MIN_LIMB_PIXELS = 4  # of a visible limb
 _MIN_UNEXPLAINED = 0.01  # of a person's pixels for a limb's end: a hand has 2 %
 STEP_SIGMAS = (0.04, 0.2, 0.35)  # [m, rad, rad] initial random steps of the root's position and rotation, and of angles
+
+
+def towards(sight: NDArray, up: NDArray) -> NDArray:
+    """(3,) horizontal unit vector against a line of sight (3,): towards the sensor, any if it looks along `up` (3,)."""
+    forward = (sight @ up) * up - sight
+    if np.linalg.norm(forward) < 1e-3:  # seen from above
+        forward = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    return np.asarray(forward / np.linalg.norm(forward))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,20 +123,13 @@ class PostureSearch:
             p = view.points[row, column]
             for R in turns:
                 for shift in (-tall, 0.0, tall):
-                    T = np.eye(4)
-                    T[:3, :3] = R
-                    T[:3, 3] = p + half * sight - R @ (centre + (0.0, shift, 0.0))
-                    roots.append(T)
+                    roots.append(se3.transform(R, p + half * sight - R @ (centre + (0.0, shift, 0.0))))
         return np.array(roots)
 
     def _turns(self, sight: NDArray) -> list[NDArray]:
         """(3, 3) candidate rotations of the root: headings in steps from the sensor, upright and leaning."""
-        up = self.up
-        forward = -sight + (sight @ up) * up
-        if np.linalg.norm(forward) < 1e-3:  # seen from above
-            forward = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-        forward /= np.linalg.norm(forward)
-        out = []
+        up, out = self.up, []
+        forward = towards(sight, up)
         for yaw in YAWS:
             f = np.cos(yaw) * forward + np.sin(yaw) * np.cross(up, forward)
             for lean, side in np.radians(LEANS):

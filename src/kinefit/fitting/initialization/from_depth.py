@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import BodyError, ObservationError, TrackingError
 from kinefit.fitting.initialization.depth_search import PostureSearch
-from kinefit.fitting.subject.depth import fit_surfaces
 from kinefit.fitting.subject.subject import SubjectFit
+from kinefit.fitting.subject.surfaces import fit_surfaces
 from kinefit.geometry.camera import Camera
 from kinefit.images.depth import denoised, noise_of, to_points, without_speckles
 from kinefit.images.depth_scene import DepthBlob, find_floor, foreground, people

@@ -155,19 +155,13 @@ def pose_from_points(
         )  # fmt: skip
         return float(fit.costs[0]), BodyState(fit.Ts_world_root[0], fit.angles[0])
 
-    starts = (
-        [near] if near else [body.default_state(aligned_root(body, points, x_world) @ _turn(a)) for a in (0.0, np.pi)]
-    )
+    turns = (se3.exp(np.array([0.0, 0.0, 0.0, 0.0, angle, 0.0])) for angle in (0.0, np.pi))
+    starts = [near] if near else [body.default_state(aligned_root(body, points, x_world) @ T) for T in turns]
     rough = [start if near else fitted(start, SQUARED, 60)[1] for start in starts]
     fits = [fitted(start, geman_mcclure() if robust else SQUARED, 40) for start in rough]
     state = min(fits, key=lambda fit: fit[0])[1]
     residuals = np.linalg.norm(body.positions(state, points)[known] - x_world[known], axis=1)
     return state, float(np.median(residuals))
-
-
-def _turn(angle: float) -> NDArray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]])
 
 
 _MAX_GAP = 0.08  # [m] between rays of a joint: annotations of a thick limb differ by 2 to 4 cm between views

@@ -13,15 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.fitting.multiview import likeness
 from kinefit.fitting.multiview.association import MAX_SPEED, MAX_STEP, Node, assign, medians
-from kinefit.fitting.multiview.likeness import (
-    Appearance,
-    ImageSource,
-    bones_of,
-    clothes_colours,
-    common_cues,
-    same_log_ratio,
-)
+from kinefit.fitting.multiview.likeness import Appearance, ImageSource
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Keypoints
 
@@ -116,8 +110,8 @@ def link_spans(
     looks = {k: _appearance(rig, keypoints, spans[k], images) for k in {k for pair in pairs for k in pair}}
     odds = np.full((n, n), -np.inf)
     for i, j in pairs:
-        way = _way_log_ratio(spans[i], spans[j], rate)
-        odds[i, j] = np.log(_PRIOR_ODDS) + same_log_ratio(looks[i], looks[j]) + way if looks[i].is_known else -np.inf
+        same, way = likeness.same_log_ratio(looks[i], looks[j]), _way_log_ratio(spans[i], spans[j], rate)
+        odds[i, j] = np.log(_PRIOR_ODDS) + same + way if looks[i].is_known else -np.inf
     follows: dict[int, tuple[int, float]] = {}
     maybe: dict[int, tuple[int, ...]] = {}
     best = _best_pairs(odds)
@@ -140,7 +134,8 @@ def link_spans(
         while chain.members[-1] in follows:
             last = chain.members[-1]
             after, ratio = follows[last]
-            away = Return(ends[last][1], ends[after][0], ratio, (*common_cues(looks[last], looks[after]), "way"))
+            cues = likeness.common_cues(looks[last], looks[after])
+            away = Return(ends[last][1], ends[after][0], ratio, (*cues, "way"))
             joined = _join_spans(chain.span, spans[after], away)
             chain = replace(chain, span=joined, members=(*chain.members, after), returns=(*chain.returns, away))
         out.append(chain)
@@ -159,7 +154,8 @@ def _split_at_replacement(
         if min(well_visible) < MAX_SHORT_ABSENCE_S * rate:
             continue
         before, after = (_appearance(rig, keypoints, part, images) for part in parts)
-        odds = np.log(_PRIOR_ODDS) + same_log_ratio(before, after, wrong_size=0.0) + _way_log_ratio(*parts, rate)
+        same = likeness.same_log_ratio(before, after, wrong_size=0.0)
+        odds = np.log(_PRIOR_ODDS) + same + _way_log_ratio(*parts, rate)
         if odds < -np.log(_MIN_ODDS):
             return [parts[0], *_split_at_replacement(rig, keypoints, parts[1], needed, images)]
     return [span]
@@ -229,8 +225,8 @@ def _way_log_ratio(a: PresenceSpan, b: PresenceSpan, rate: float) -> float:
 
 def _appearance(rig: Rig, keypoints: Sequence[Keypoints], span: PresenceSpan, images: ImageSource | None) -> Appearance:
     views = {f: nodes for f, nodes in span.nodes.items() if len(nodes) > 1}
-    looks = bones_of(rig, keypoints, views)
-    return looks if images is None else replace(looks, colours=clothes_colours(keypoints, views, images))
+    looks = likeness.bones_of(rig, keypoints, views)
+    return looks if images is None else replace(looks, colours=likeness.clothes_colours(keypoints, views, images))
 
 
 def _join_spans(a: PresenceSpan, b: PresenceSpan, away: Return) -> PresenceSpan:

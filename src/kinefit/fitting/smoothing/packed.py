@@ -17,6 +17,7 @@ from kinefit.fitting.smoothing.shared_errors import SharedErrors
 from kinefit.fitting.smoothing.spool import STRETCH, stretches
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.losses import SQUARED, Loss
+from kinefit.observations import by_record
 from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.channels import Channels, joined
 from kinefit.sensors.evidence import Evidence
@@ -267,9 +268,7 @@ class PackedMarkers(PackedPoints):
         column, columns = dict[tuple[str, str, str], int](), dict[tuple[str, str, tuple[str, ...]], list[int]]()
         places, stated = room((len(times), 0, 3)), room((len(times), 0))
         for f, several in enumerate(measurements):
-            for m in several:
-                if not isinstance(m, MarkerMeasurement):
-                    continue
+            for m in by_record(several)[MarkerMeasurement]:
                 if abs(m.time - times[f]) > _MAX_TIME_GAP_S or m.of.loss != loss:
                     apart.add(m.sensor)
                 key = m.sensor, m.marker_set

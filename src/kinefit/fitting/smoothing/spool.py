@@ -20,28 +20,22 @@ from kinefit.geometry.losses import Loss
 from kinefit.images.regions import Ratios, RegionColours
 from kinefit.sensors.base import Leftover, RowsOf
 from kinefit.sensors.displaced import Displaced, DisplacedMatched
-from kinefit.sensors.points.body_trackers import BodyTrackerMatched, BodyTrackerMeasurement
-from kinefit.sensors.points.image_lines import ImageLineMatched, ImageLineMeasurement
-from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement
-from kinefit.sensors.points.lifted import LiftedMatched, LiftedMeasurement
-from kinefit.sensors.points.markers import MarkerMatched, MarkerMeasurement
-from kinefit.sensors.points.poses import PoseMatched, PoseMeasurement
-from kinefit.sensors.regions.region_parts import Coloured, Kept, Lines, Seams
-from kinefit.sensors.regions.regions import RegionMatched, RegionMeasurement
-from kinefit.sensors.regions.silhouette import SilhouetteMatched, SilhouetteMeasurement
-from kinefit.sensors.surfaces.depth_image import DepthImageMatched, DepthImageMeasurement
-from kinefit.sensors.surfaces.point_cloud import FreePairs, PointCloudMatched, PointCloudMeasurement, SurfacePairs
-from kinefit.sensors.surfaces.surface_points import SurfacePointMatched, SurfacePointMeasurement
+from kinefit.sensors.points import body_trackers, image_lines, keypoints, lifted, markers, poses
+from kinefit.sensors.regions import region_parts, regions, silhouette
+from kinefit.sensors.surfaces import depth_image, point_cloud, surface_points
 from kinefit.sensors.visibility.occlusion import Hidden
 from kinefit.solving.correspondences.contours.outlines import Rim
 
 CODEC = Codec([
     BodyState, PointSet, SurfaceAnchors, Rim, FrameResult, Ratios, RegionColours, Loss, Leftover, RowsOf,
-    DepthImageMatched, DepthImageMeasurement, Displaced, DisplacedMatched, ImageLineMatched, ImageLineMeasurement,
-    KeypointMatched, KeypointMeasurement, LiftedMatched, LiftedMeasurement, MarkerMatched, MarkerMeasurement, Hidden,
-    PointCloudMatched, PointCloudMeasurement, Coloured, Kept, RegionMatched, Lines, Seams, RegionMeasurement,
-    SilhouetteMatched, SilhouetteMeasurement, FreePairs, SurfacePairs, SurfacePointMatched, SurfacePointMeasurement,
-    BodyTrackerMatched, BodyTrackerMeasurement, PoseMatched, PoseMeasurement,
+    depth_image.DepthImageMatched, depth_image.DepthImageMeasurement, Displaced, DisplacedMatched,
+    image_lines.ImageLineMatched, image_lines.ImageLineMeasurement, keypoints.KeypointMatched,
+    keypoints.KeypointMeasurement, lifted.LiftedMatched, lifted.LiftedMeasurement, markers.MarkerMatched,
+    markers.MarkerMeasurement, Hidden, point_cloud.PointCloudMatched, point_cloud.PointCloudMeasurement,
+    region_parts.Coloured, region_parts.Kept, regions.RegionMatched, region_parts.Lines, region_parts.Seams,
+    regions.RegionMeasurement, silhouette.SilhouetteMatched, silhouette.SilhouetteMeasurement, point_cloud.FreePairs,
+    point_cloud.SurfacePairs, surface_points.SurfacePointMatched, surface_points.SurfacePointMeasurement,
+    body_trackers.BodyTrackerMatched, body_trackers.BodyTrackerMeasurement, poses.PoseMatched, poses.PoseMeasurement,
 ])  # fmt: skip
 """Writes and reads records of tracked frames, without what all frames share (bodies, sensors, cameras)."""
 

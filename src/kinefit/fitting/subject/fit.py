@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import check_shape, checked
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
-from kinefit.fitting.subject.parameters import FrameRows, Parameters, World, excess, stacked
+from kinefit.fitting.subject.parameters import FrameRows, Parameters, World, excess, stacked, with_slices
 from kinefit.fitting.subject.point_moves import ClosureMoves, PointMoves, closing_rows
 from kinefit.fitting.subject.subject import CameraExtrinsics, Progress, SubjectFit
 from kinefit.geometry.camera import Rig
@@ -28,7 +28,7 @@ from kinefit.sensors.scene import Scene
 from kinefit.solving.bundle.border import Bordered, Prior, solve
 from kinefit.solving.bundle.border_frames import MAX_POSE_STEPS, POSTURE_SHARE, Part, Weighing, apart
 from kinefit.solving.equations import inverse
-from kinefit.solving.pixels import PixelPoints
+from kinefit.solving.least_squares import PixelPoints
 from kinefit.solving.rows import AnyRows, Rows
 
 CLOSURES = "closures"
@@ -50,8 +50,7 @@ class Worlds:
 
     def __init__(self, world: World, parameters: Sequence[Parameters]) -> None:
         self._first = world
-        ends = np.cumsum([0, *(len(kind.names) for kind in parameters)])
-        self._parameters = [(kind, slice(int(a), int(b))) for kind, a, b in zip(parameters, ends, ends[1:])]
+        self._parameters = with_slices(parameters)
         # Cameras do not depend on bodies: applied first, they are not applied again for every body.
         self._applied = sorted(self._parameters, key=lambda each: not isinstance(each[0], CameraExtrinsics))
         self._cache: dict[tuple[int, bytes], tuple[World, World]] = {}

@@ -301,6 +301,12 @@ def place_spread(moved: NDArray, variance: NDArray, spread: ArrayLike, believed:
     return float(np.sqrt((np.sum(moved**2) + _PRIOR_COORDINATES * believed**2) / (measured + _PRIOR_COORDINATES)))
 
 
+def with_slices(parameters: Sequence[Parameters]) -> list[tuple[Parameters, slice]]:
+    """Each kind of parameters, and its slice of all p."""
+    ends = np.cumsum([0, *(len(kind.names) for kind in parameters)]).tolist()
+    return [(kind, slice(*ends[k : k + 2])) for k, kind in enumerate(parameters)]
+
+
 def stacked(parameters: Sequence[Parameters]) -> tuple[tuple[str, ...], NDArray, NDArray, NDArray]:
     """Names, mean (p,), information (p, p) and steps (p,) of several kinds, concatenated.
 
@@ -314,9 +320,8 @@ def stacked(parameters: Sequence[Parameters]) -> tuple[tuple[str, ...], NDArray,
     if not names or twice:
         problem = f"two parameters named '{twice[0]}'" if twice else "no parameters to fit"
         raise ObservationError(problem, remedy="Give each kind of parameter once, such as SegmentScales(body).")
-    information, first = np.zeros((len(names), len(names))), 0
-    for kind in parameters:
-        own = slice(first, first := first + len(kind.names))
+    information = np.zeros((len(names), len(names)))
+    for kind, own in with_slices(parameters):
         information[own, own] = kind.information
     mean, step = (np.concatenate([getattr(kind, name) for kind in parameters]) for name in ("mean", "step"))
     return names, mean, information, step

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
-from kinefit.solving import _kernels_border
+from kinefit.solving import _kernels_linear
 from kinefit.solving.correspondences.closures import closed_at, closure_values
 from kinefit.solving.rows import DofRows, Rows
 
@@ -105,13 +105,13 @@ class PointMoves:
             return None
         out = np.empty((len(rows), moves.shape[2]))
         joints = self.joints(tree, frames)
-        _kernels_border.point_columns(rows.data, rows.segment, rows.group, frames, joints, moves, out)
+        _kernels_linear.point_columns(rows.data, rows.segment, rows.group, frames, joints, moves, out)
         return out
 
     def joints(self, tree: KinematicTree, frames: NDArray) -> NDArray:
         """(S, 3, q) derivatives of the joint centres in the world, for a fixed pose; frames (S, 12) of the segments."""
         out = np.empty(self._joints.shape)
-        _kernels_border.joint_columns(tree.parents, frames, self._joints, out)
+        _kernels_linear.joint_columns(tree.parents, frames, self._joints, out)
         return out
 
     def _of(self, places: Sequence[Place]) -> NDArray | None:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
-from kinefit.fitting.subject.parameters import Parameters, World, place_spread
+from kinefit.fitting.subject.parameters import Parameters, World, place_spread, with_slices
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.base import Sensor, Unknown, of_kind
@@ -399,8 +399,7 @@ class SubjectFit:
     @property
     def kinds(self) -> list[tuple[Parameters, slice]]:
         """Each kind of parameters, and its slice of all p."""
-        ends = np.cumsum([0, *(len(kind.names) for kind in self.parameters)]).tolist()
-        return [(kind, slice(*ends[k : k + 2])) for k, kind in enumerate(self.parameters)]
+        return with_slices(self.parameters)
 
     def record(self) -> dict[str, list[float]]:
         """{parameter: [estimate, standard deviation]}, each in its own unit."""

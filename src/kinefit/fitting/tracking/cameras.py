@@ -15,18 +15,11 @@ from numpy.typing import NDArray
 from kinefit.bodies import BodyState
 from kinefit.bodies.motion import Residuals
 from kinefit.fitting.frame.routing import Sensors
-from kinefit.fitting.subject.subject import (
-    OUTLIER_SIGMAS,
-    CameraExtrinsics,
-    SensorFrames,
-    Subject,
-    SubjectFit,
-    moved_rig,
-)
+from kinefit.fitting.subject.subject import OUTLIER_SIGMAS, SensorFrames, Subject, SubjectFit, moved_rig
 from kinefit.fitting.tracking.recording import Recording, spread
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.observations import DepthFrame
+from kinefit.observations import DepthFrame, by_record
 from kinefit.sensors.alignment import MISFIT_SIGMAS, POSE_SIGMAS, SensorAlignment
 from kinefit.sensors.base import Matched, Measurement, rows_at
 from kinefit.sensors.displaced import Displaced, displacement
@@ -51,15 +44,10 @@ _MIN_MEASURED_SHARE = 1e-6  # share of a direction that nothing measures
 def as_record(found: Sequence[SubjectFit]) -> dict[str, Any]:
     """How far the last of several fits that sought cameras moved them, for `Motion.provenance`."""
     for fit in reversed(found):
-        first = 0
-        for one in fit.parameters:
-            own, first = slice(first, first + len(one.names)), first + len(one.names)
-            if isinstance(one, CameraExtrinsics):
-                values, std = fit.mean[own].reshape(-1, 6), fit.std[own].reshape(-1, 6)
-                return {
-                    name: {"moved": value.tolist(), "std": s.round(6).tolist()}
-                    for name, value, s in zip(one.free, values, std)
-                }
+        if (cameras := fit.cameras) is not None:
+            own = next(own for kind, own in fit.kinds if kind is cameras)
+            each = zip(cameras.free, fit.mean[own].reshape(-1, 6), fit.std[own].reshape(-1, 6))
+            return {name: {"moved": value.tolist(), "std": s.round(6).tolist()} for name, value, s in each}
     return {}
 
 
@@ -247,8 +235,8 @@ def placed_cameras(recording: Recording, subject: Subject, settings: TrackSettin
     videos = {k.camera for k in recording.keypoints}
     looks: dict[str, list[Look]] = {}
     for k in spread(len(subject.frames), _FRAMES):
-        for frame in recording.steps(subject.frames[k]):
-            if isinstance(frame, DepthFrame) and recording.rig[frame.sensor].name not in videos:
+        for frame in by_record(recording.steps(subject.frames[k]))[DepthFrame]:
+            if recording.rig[frame.sensor].name not in videos:
                 state, samples = subject.fit.states[k], settings.samples
                 scene = Scene(subject.body, state, recording.rig, time=frame.time, samples=samples)
                 looks.setdefault(frame.sensor, []).append(([frame], scene))

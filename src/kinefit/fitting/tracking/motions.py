@@ -37,7 +37,7 @@ from kinefit.fitting.tracking.recording import spread
 from kinefit.geometry.losses import SQUARED
 from kinefit.observations.arrays import numbers
 from kinefit.sensors.base import Leftover, Matched, leftovers_at
-from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement, Layout, pixels_of
+from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement, Layout, pixels_and_others, pixels_of
 from kinefit.sensors.scene import Scene
 
 
@@ -137,8 +137,8 @@ def motion_of(
     def weighed(f: int) -> tuple[Scene, list[Matched]]:
         """The same with keypoints as they took part."""
         scene, several = with_markers(f)
-        pixels = {"weight": weight[f], "loss": SQUARED}
-        return scene, [replace(m, **pixels) if isinstance(m, KeypointMatched) else m for m in several]
+        pixels, others = pixels_and_others(several)
+        return scene, [*(replace(m, weight=weight[f], loss=SQUARED) for m in pixels), *others]
 
     scale = take.scale
     answers = [partial(shape_errors, one, settings, weighed, scale=scale) for one in found]
@@ -198,8 +198,9 @@ def _behind(
 
     def take(late: list[FrameResult]) -> None:
         for r in late:
-            matched.append(tuple(m for m in r.matched if not isinstance(m, KeypointMatched)))
-            out.append(replace(r, matched=tuple(pixels_of(r.matched))))
+            pixels, others = pixels_and_others(r.matched)
+            matched.append(tuple(others))
+            out.append(replace(r, matched=tuple(pixels)))
 
     for result in frames.results:
         take(behind.add(result, result.measurements, ahead=1))

@@ -169,8 +169,8 @@ class Recording:
     def sees_more(self) -> bool:
         """Whether in the first steps any other sensor than the keypoints' detectors sees something; clicks are none."""
         first = range(min(len(self), _FIRST_STEPS))
-        others = (sum(not isinstance(f, ClickFrame) for f in self.steps(i)) - len(self.keypoints_at(i)) for i in first)
-        return any(count > 0 for count in others)
+        steps = ((self.steps(i), len(self.keypoints_at(i))) for i in first)
+        return any(len(seen) - len(by_record(seen)[ClickFrame]) > keypoints for seen, keypoints in steps)
 
     @property
     def markers_alone(self) -> bool:
@@ -252,9 +252,11 @@ class Recording:
 
     def part(self, frames: slice) -> Recording:
         """A stretch of its steps."""
-        first = range(len(self))[frames].start
+        own = range(len(self))[frames]
+        start = (self.start[0] - own.start, self.start[1]) if self.start and self.start[0] in own else None
         return replace(
-            self, times=self.times[frames], steps=lambda i: self.steps(i + first),
+            self, times=self.times[frames], steps=lambda i: self.steps(i + own.start), start=start,
+            poses={i - own.start: state for i, state in self.poses.items() if i in own},
             keypoints=tuple(_cut(k, frames) for k in self.keypoints),
         )  # fmt: skip
 

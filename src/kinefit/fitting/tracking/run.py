@@ -116,18 +116,17 @@ def tracker_of(
 
 
 def run(
-    recording: Recording, body: Body, settings: TrackSettings, *, start: Any = None, values: Any = None,
-    view_bias: ViewBias | None = None, poses: Mapping[int, BodyState] | None = None, progress: Progress | None = None,
-    checkpoint: Checkpoint | None = None,
+    recording: Recording, body: Body, settings: TrackSettings, *, values: Any = None, view_bias: ViewBias | None = None,
+    progress: Progress | None = None, checkpoint: Checkpoint | None = None,
 ) -> TrackedSteps:  # fmt: skip
     """Track all steps of a recording, each from those before it.
 
     Parameters
     ----------
-    start : step and state to begin with; default: the first that the tracker finds by itself.
+    recording : its `start` is the first that the tracker finds by itself where none is given; its `poses` are where the
+        body may be, by an earlier fit
     values : {sensor: {name: value}} of the sensors' own unknowns
     view_bias : of the keypoints' detectors; default: none
-    poses : {step: state} where the body may be, by an earlier fit
     checkpoint : where it goes on from, and what is done is kept
 
     Raises
@@ -137,8 +136,8 @@ def run(
     """
     anew = partial(tracker_of, recording, body, settings, values=values, view_bias=view_bias)
     tracker, times, begin = anew(), recording.times, 0
-    if start is not None:
-        begin, state = start
+    if recording.start is not None:
+        begin, state = recording.start
         tracker.start_at(state)
     frames, at = _Frames(checkpoint, recording), begin
     others = OtherPeople(recording.others, recording.rig, 0.5 / recording.rate + 1e-6)
@@ -149,8 +148,7 @@ def run(
             tracker = frames.go_on(checkpoint, checkpoint.frames.state, anew())
 
     def step(tracker: Tracker, i: int, time: float) -> bool:
-        guess = None if poses is None else poses.get(i)
-        seen = recording.steps(i)
+        seen, guess = recording.steps(i), recording.poses.get(i)
         if not len(seen) and not recording.looked[i]:
             found = tracker.between(time)
         else:

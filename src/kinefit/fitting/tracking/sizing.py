@@ -276,7 +276,6 @@ def _by_all(
     many = _REFINING_POSES if r.poses else many
     near = person.poses or {i: r.poses[i] for i in spread(len(r.poses), many).tolist()}
     stretch = slice(first, min(first + tried, len(r)))
-    start = None if person.start is None else (0, person.start[1])
     counted = None
     if progress:
         counted = lambda what, done, total: progress("shape", done, total)
@@ -284,9 +283,8 @@ def _by_all(
         if near:
             first, tracked = 0, _fitted_at(near, r, body, settings)
         else:
-            tracked = run(
-                r.part(stretch), body, settings, start=start, view_bias=person.subject.view_bias, progress=counted
-            )
+            part = replace(r, start=person.start).part(stretch)
+            tracked = run(part, body, settings, view_bias=person.subject.view_bias, progress=counted)
     except TrackingError as error:
         return person.reporting(shape=f"not found: {error.problem}")
     shown = [k for k, result in enumerate(tracked.results) if result.measurements or r.keypoints]

@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit import observations
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.marker_sets import LANDMARK_SPREAD, MarkerPlacement, bare, find_placement, known_set, matched
 from kinefit.bodies.motion import UP_AXES, Motion
@@ -24,17 +25,6 @@ from kinefit.fitting.tracking.recording import Recording, spread
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
-from kinefit.observations import (
-    KEYPOINT_SIGMA,
-    ClickFrame,
-    DepthFrame,
-    DepthVideo,
-    KeypointVideo,
-    Markers,
-    NamedMarkers,
-    SilhouetteFrame,
-    by_record,
-)
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.cameras import is_level
 from kinefit.readers.take.entries import sensor_name
@@ -117,7 +107,7 @@ def recording_of(
         What the sensors' readers raise; markers of which the body knows none.
     """
     stereo = load_stereo(take, seen)
-    depth: tuple[DepthVideo, ...] = (*seen.depth, *stereo)
+    depth: tuple[observations.DepthVideo, ...] = (*seen.depth, *stereo)
     rig = Rig((*(seen.rig or ()), *(v.camera for v in stereo if v.camera is not None)))
     known = _motion_poses(take, body, seen)
     start = (0, known[0]) if known else posed_start(take, body, seen.frames)
@@ -132,7 +122,7 @@ def recording_of(
             k = video.at_step(first + i, rate)
             if k is not None:
                 out.append(video.frame(k))
-            elif isinstance(video, KeypointVideo):
+            elif isinstance(video, observations.KeypointVideo):
                 out.append(video.unseen(float(times[i])))
         frames = (m.at(float(times[i])) for m in marked)
         return [*out, *(f for f in frames if f is not None)]
@@ -169,21 +159,19 @@ def recording_of(
 def _clicked_on_person(frames: Sequence[Any], i: int, seen: Observations, of_person: Recording) -> Sequence[Any]:
     """Frames of a step without clicks on others: the person with the nearest keypoint in the image was clicked on."""
     who = of_person.followed
-    if who is None or len(who.people) < 2 or not any(isinstance(f, ClickFrame) for f in frames):
+    if who is None or len(who.people) < 2:
         return frames
-    out = []
-    for frame in frames:
-        if isinstance(frame, ClickFrame):
-            uv, distance = frame.ends.mean(axis=1), np.full((len(frame.names), len(who.people)), np.inf)
-            for q, k in enumerate(seen.keypoints):
-                for p, one in enumerate(who.people if k.camera == frame.sensor else ()):
-                    own = k.points[i, one.chosen[q][i]] if one.chosen[q][i] >= 0 else np.full((1, 2), np.inf)
-                    away = np.linalg.norm(uv[:, None] - own, axis=2)
-                    distance[:, p] = np.fmin(distance[:, p], np.fmin.reduce(away, axis=1))
-            on_other = distance[:, who.number - 1] > distance.min(axis=1)
-            frame = replace(frame, ends=np.where(on_other[:, None, None], np.nan, frame.ends))
-        out.append(frame)
-    return out
+    on_person = {}
+    for frame in observations.by_record(frames)[observations.ClickFrame]:
+        uv, distance = frame.ends.mean(axis=1), np.full((len(frame.names), len(who.people)), np.inf)
+        for q, k in enumerate(seen.keypoints):
+            for p, one in enumerate(who.people if k.camera == frame.sensor else ()):
+                own = k.points[i, one.chosen[q][i]] if one.chosen[q][i] >= 0 else np.full((1, 2), np.inf)
+                away = np.linalg.norm(uv[:, None] - own, axis=2)
+                distance[:, p] = np.fmin(distance[:, p], np.fmin.reduce(away, axis=1))
+        on_other = distance[:, who.number - 1] > distance.min(axis=1)
+        on_person[id(frame)] = replace(frame, ends=np.where(on_other[:, None, None], np.nan, frame.ends))
+    return [on_person.get(id(frame), frame) for frame in frames]
 
 
 def with_fitted_start(
@@ -193,7 +181,7 @@ def with_fitted_start(
     if recording.start is None:
         return recording
     step, state = recording.start
-    shown = by_record(recording.steps(step))[SilhouetteFrame]
+    shown = observations.by_record(recording.steps(step))[observations.SilhouetteFrame]
     if not shown:
         return recording
     found = coarse_to_fine(
@@ -202,7 +190,7 @@ def with_fitted_start(
     return replace(recording, start=(step, found.result.state))
 
 
-def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict[str, float]:
+def _sigma(take: Take, seen: Observations, stereo: Sequence[observations.DepthVideo]) -> dict[str, float]:
     """Standard deviation of every sensor, [m] or [px]."""
     out = {entry.name: entry.sigma for entry in take.depth}
     out |= {entry.name: stereo_sigma(entry, video, seen) for entry, video in zip(take.stereo, stereo)}
@@ -212,7 +200,7 @@ def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict
     out |= {
         f"{seen_by.camera} {seen_by.keypoint_set}": seen_by.sigma
         for entry, seen_by in zip(take.keypoints, seen.keypoints)
-        if seen_by.sigma is not None and entry.sigma == KEYPOINT_SIGMA
+        if seen_by.sigma is not None and entry.sigma == observations.KEYPOINT_SIGMA
     }  # fmt: skip
     return out | {sensor_name("markers", take.markers, k): entry.sigma for k, entry in enumerate(take.markers)}
 
@@ -260,12 +248,10 @@ def posed_start(take: Take, body: Body, frames: tuple[int, int]) -> tuple[int, B
     y, x = np.array(pose.upward or UP_AXES[take.up], float), np.array(pose.forward, float)
     if pose.upward is None:  # upright: forward as far as it is level
         x = x - (x @ y) * y
-    T = np.eye(4)
-    T[:3, 0] = x / np.linalg.norm(x)
-    z = np.cross(T[:3, 0], y)
-    T[:3, 2] = z / np.linalg.norm(z)
-    T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
-    T[:3, 3] = pose.at
+    x = x / np.linalg.norm(x)
+    z = np.cross(x, y)
+    z = z / np.linalg.norm(z)
+    T = se3.transform(np.stack([x, np.cross(z, x), z], axis=1), np.array(pose.at))
     angles = np.array(body.default_state(T).angles)
     for name, value in pose.angles.items():
         if name not in tree.coordinates:
@@ -301,7 +287,7 @@ def _motion_poses(take: Take, body: Body, seen: Observations) -> dict[int, BodyS
     return {i: BodyState(T, q) for i, (T, q) in enumerate(zip(roots, motion.angles)) if take.size or not i}
 
 
-def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMarkers], Body]:
+def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[observations.NamedMarkers], Body]:
     """All marker recordings by the names of the body's sets; a set of the catalogue is put on the body where needed."""
     out = []
     for k, (entry, markers, trial) in enumerate(zip(take.markers, seen.markers, seen.static_markers, strict=True)):
@@ -310,11 +296,12 @@ def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMark
         if own and own not in body.marker_sets:
             body = replace(body, marker_sets={**body.marker_sets, own: known})
         named, trial = _named_as(markers, known.names), trial and _named_as(trial, known.names)
-        out.append(NamedMarkers(sensor_name("markers", take.markers, k), named, own, entry.time_offset, std, trial))
+        name = sensor_name("markers", take.markers, k)
+        out.append(observations.NamedMarkers(name, named, own, entry.time_offset, std, trial))
     return out, body
 
 
-def _named_as(markers: Markers, known: Sequence[str]) -> Markers:
+def _named_as(markers: observations.Markers, known: Sequence[str]) -> observations.Markers:
     """The markers that a set knows, by its names."""
     names = matched(markers.names, known)
     here = [i for i, (label, name) in enumerate(zip(markers.names, names)) if (name or bare(label)) in known]
@@ -390,7 +377,7 @@ def pose_findings_of(take: Take, seen: Observations, body: Body, *, refuse: bool
             found: tuple[Finding, ...] = ()
             with suppress(KinefitError):  # which tracking raises
                 placed = MarkerPlacement(sensor.name, points, np.full(len(points), std))
-                seen_as = Markers(names, recording.rate, x, up=take.up.strip("-"))
+                seen_as = observations.Markers(names, recording.rate, x, up=take.up.strip("-"))
                 found = label_findings(body, seen_as, placed, sides=entry.sides)
             found = tuple(f for f in found if (f.severity, f.kind) == ("fault", "sides"))
             out += [replace(f, remedy=f.remedy.replace("[[markers]]", "[[pose]]")) for f in found]
@@ -422,7 +409,7 @@ def _set_of(body: Body, labels: Sequence[str], wanted: str | None) -> tuple[str,
     return placed.name, placed.points, placed.spread
 
 
-def _first_depth(depth: Sequence[DepthVideo], seen: Observations) -> dict[int, DepthFrame]:
+def _first_depth(depth: Sequence[observations.DepthVideo], seen: Observations) -> dict[int, observations.DepthFrame]:
     """Some images of the first depth sensor from the beginning of the take, by step."""
     start, stop = seen.frames
     for video in depth:
@@ -433,7 +420,7 @@ def _first_depth(depth: Sequence[DepthVideo], seen: Observations) -> dict[int, D
     return {}
 
 
-def _backgrounds(depth: Sequence[DepthVideo]) -> dict[str, NDArray]:
+def _backgrounds(depth: Sequence[observations.DepthVideo]) -> dict[str, NDArray]:
     """What depth sensors saw of the empty scene."""
     out = {}
     for video in depth:

@@ -54,10 +54,9 @@ class Unknowns:
         found : a fit of these unknowns
         stated : with the spreads that are stated
         """
-        parameters, first, variance = list(self.parameters), 0, np.diag(found.covariance)
+        parameters, variance = list(self.parameters), np.diag(found.covariance)
         moved = found.mean - found.prior.mean
-        for k, (one, before) in enumerate(zip(self.parameters, stated.parameters)):
-            own = slice(first, first := first + len(one.names))
+        for k, ((one, own), before) in enumerate(zip(kinds.with_slices(self.parameters), stated.parameters)):
             if isinstance(one, kinds.PointOffsets) and isinstance(before, kinds.PointOffsets):
                 if one.name not in one.body.marker_sets:
                     continue

@@ -132,8 +132,8 @@ def motion_of_person(
     if (how.smooth or each) and how.lag is None and person.start is None and not person.poses:
         fitted = fit_marker_steps(recording, person.subject.body, settings, judge=not how.smooth, progress=progress)
     tracked = fitted or run(
-        recording, person.subject.body, settings, start=person.start, values=person.values,
-        view_bias=person.subject.view_bias, poses=person.poses, progress=progress, checkpoint=checkpoint,
+        replace(recording, start=person.start, poses=person.poses), person.subject.body, settings,
+        values=person.values, view_bias=person.subject.view_bias, progress=progress, checkpoint=checkpoint,
     )  # fmt: skip
     tracker = tracked.tracker
     others = {} if recording.followed is None else recording.followed.as_record()

@@ -7,7 +7,7 @@ import numpy as np
 from kinefit._jit import jit
 from kinefit.geometry._kernels_matrices import copy, inverse, times, times_transposed
 from kinefit.markers.frame._kernels_evidence import rigid
-from kinefit.solving.correspondences._kernels_closures import rotation_vector
+from kinefit.solving.correspondences._kernels import rotation_vector
 
 MAX_ITERATIONS = 8
 _UNKNOWN_TURN_INFORMATION = 0.1  # [1/rad²] prior of an unknown turn

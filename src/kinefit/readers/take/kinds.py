@@ -26,8 +26,8 @@ BUILT_IN = {
     "region": "kinefit.sensors.kinds.silhouettes:REGIONS",
     "lines": "kinefit.sensors.kinds.lines:KIND",
     "surface_points": "kinefit.sensors.kinds.surface_points:KIND",
-    "tracker": "kinefit.sensors.kinds.trackers:KIND",
-    "pose": "kinefit.sensors.kinds.poses:KIND",
+    "tracker": "kinefit.sensors.kinds.poses:TRACKERS",
+    "pose": "kinefit.sensors.kinds.poses:POSES",
 }
 """{table of a take file: where its kind stands}, in the order in which they are read."""
 

@@ -1,10 +1,13 @@
-"""`[[pose]]`: joints in space, or a whole motion, that another program estimated: a second opinion."""
+"""`[[pose]]`: joints in space, or a whole motion, that another program estimated: a second opinion.
+
+`[[tracker]]`: trackers fixed on the body, such as magnetic ones: poses of segments, or places of points.
+"""
 
 from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
@@ -12,23 +15,133 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta, field
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from kinefit._files import LENGTHS, rate_of, read_npz, read_text, repeated, worth
+from kinefit._files import LENGTHS, rate_of, read_npz, read_table, read_text, repeated, worth
 from kinefit.bodies import Body
 from kinefit.bodies.marker_sets.sets import read_sides
 from kinefit.bodies.motion import UP_AXES
 from kinefit.bodies.toml.joint_names import LIMBS, SIDES, conventions, find, plain
 from kinefit.errors import FileError, KinefitError, ObservationError, check_choice, choices
 from kinefit.geometry import se3
+from kinefit.observations import BodyTrackerFrame, SensorRecording
 from kinefit.readers.markers import read_markers
 from kinefit.readers.motion import FORMAT, read_motion
 from kinefit.readers.skeletons.bvh import read_bvh
 from kinefit.readers.take.cameras import TakeCameras, stated_rate
 from kinefit.readers.take.entries import Metres, PlacedEntry, Rate
 from kinefit.readers.take.kinds import Proposal, SensorKind, refuse
-from kinefit.sensors.kinds.trackers import BodyTrackerRecording
+from kinefit.sensors.points.body_trackers import BodyTrackerSensor
 from kinefit.sensors.points.poses import HIPS, Place, PoseErrors, PoseSensor
+
+_POSITION_COLUMNS = ("time_s", "x", "y", "z")
+_QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
+_TABLE_REMEDY = "Give a table with the columns time_s, tracker, x, y, z [s, m] and, for orientations, qw, qx, qy, qz."
+_MAX_NORM_ERROR = 0.5  # of a unit quaternion; rounding changes it by much less
+
+
+class TrackerEntry(PlacedEntry, frozen=True, kw_only=True):
+    """`[[tracker]]`."""
+
+    points: dict[str, str]  # of each tracker of the file: landmark of the body, or segment, whose origin it then is
+    mounts: dict[str, tuple[float, float, float]] = field(default_factory=dict)  # [deg] rotation vector, from a
+    # tracker's axes to its segment's
+    rotation_sigma: float = 2.0  # [deg] standard deviation of an orientation
+    mount_sigma: float = 0.0  # [deg] standard deviation of the mounts, which are then estimated; default: exact
+
+
+@dataclass(frozen=True, eq=False)
+class BodyTrackerRecording(SensorRecording):
+    """Trackers on the body over time.
+
+    Parameters
+    ----------
+    sensor, rate, times : see `SensorRecording`
+    names : (K,) of the trackers
+    x_world : (F, K, 3) [m]; NaN if missing
+    Rs_world_tracker : (F, K, 3, 3); NaN if missing
+    source : file, for messages
+    """
+
+    names: tuple[str, ...]
+    x_world: NDArray
+    Rs_world_tracker: NDArray
+    source: str = ""
+
+    def frame(self, i: int) -> BodyTrackerFrame:
+        """Frame number `i`; a negative number counts from the end."""
+        i, time = self._at(i)
+        return BodyTrackerFrame(self.sensor, time, self.names, self.x_world[i], self.Rs_world_tracker[i])
+
+
+def read_body_trackers(
+    path: Path, names: Iterable[str], sensor: str = "trackers", *, time_offset: float = 0.0,
+    T_world_file: ArrayLike | None = None,
+) -> BodyTrackerRecording:  # fmt: skip
+    """Read named trackers of a table with the columns time_s, tracker, x, y, z [s, m], and optional qw, qx, qy, qz.
+
+    Parameters
+    ----------
+    names : of the trackers to read; other rows are skipped
+    time_offset : float [s] added to the times
+    T_world_file : (4, 4) [m] from the frame of the table to the world; default: they are the same
+
+    Raises
+    ------
+    FileError
+        No such table, other columns, an invalid number or quaternion, a tracker twice at one time.
+    ObservationError
+        A name that the table lacks; a single time, which gives no rate.
+    """
+    names, T = tuple(names), np.eye(4) if T_world_file is None else np.asarray(T_world_file, float)
+    labels, values = read_table(path, _POSITION_COLUMNS, _TABLE_REMEDY, text="tracker", optional=_QUATERNION_COLUMNS)
+    for name in names:
+        if name not in labels:
+            remedy = "Correct the name in `points` of this [[tracker]]."
+            raise ObservationError(choices("tracker", name, list(dict.fromkeys(labels))), file=path, remedy=remedy)
+    turned = np.isfinite(values[:, 4:]).all(axis=1)
+    norm = np.linalg.norm(values[:, 4:], axis=1)
+    odd = ~np.isnan(values[:, 4:]).all(axis=1) & ~(turned & (np.abs(norm - 1.0) < _MAX_NORM_ERROR))
+    for bad, problem in (
+        (~np.isfinite(values[:, :4]).all(axis=1), "a number that is not finite"),
+        (odd, "qw, qx, qy, qz are not a unit quaternion"),
+    ):
+        if bad.any():
+            place = f"line {int(np.argmax(bad)) + 2}"
+            raise FileError(problem, file=path, place=place, remedy="Remove the row, or leave its quaternion empty.")
+    keys = [(t, name) for t, name in zip(values[:, 0].tolist(), labels)]
+    if twice := repeated(f"{name} at {t:g} s" for t, name in keys):
+        raise FileError(f"{twice[0]} has two rows", file=path, remedy="Keep one.")
+    times, frame = np.unique(values[:, 0], return_inverse=True)
+    x, R = np.full((len(times), len(names), 3), np.nan), np.full((len(times), len(names), 3, 3), np.nan)
+    for k, name in enumerate(names):
+        own = np.array([label == name for label in labels])
+        x[frame[own], k] = se3.apply(T, values[own, 1:4])
+        R[frame[own & turned], k] = T[:3, :3] @ se3.rotation_from_quaternion(values[own & turned, 4:])
+    rate = rate_of(times, path, _TABLE_REMEDY)
+    return BodyTrackerRecording(sensor, rate, times + time_offset, names, x, R, source=str(path))
+
+
+def _read_trackers(entry: TrackerEntry, name: str, _: Any) -> BodyTrackerRecording:
+    T = entry.T_world_file
+    return read_body_trackers(entry.file, entry.points, name, time_offset=entry.time_offset, T_world_file=T)
+
+
+def _tracker_sensor(entry: TrackerEntry, recording: BodyTrackerRecording, body: Body) -> BodyTrackerSensor:
+    turn, mounts = np.radians(entry.rotation_sigma), {name: np.radians(m) for name, m in entry.mounts.items()}
+    sensor = BodyTrackerSensor(
+        recording.sensor, entry.points, sigma=entry.sigma, rotation_sigma=float(turn), mounts=mounts,
+        mount_sigma=float(np.radians(entry.mount_sigma)),
+    )  # fmt: skip
+    sensor.places(body, recording.names)
+    return sensor
+
+
+TRACKERS = SensorKind(
+    table="tracker", summary="trackers fixed on the body: poses of segments, or places of points", label="trackers",
+    entry=TrackerEntry, read=_read_trackers, sensor=_tracker_sensor, finds_pose=True, replaces_keypoints=True,
+)  # fmt: skip
+
 
 _SMPL = tuple(
     "Pelvis L_Hip R_Hip Spine1 L_Knee R_Knee Spine2 L_Ankle R_Ankle Spine3 L_Foot R_Foot Neck L_Collar R_Collar Head "
@@ -221,7 +334,7 @@ def places_of(names: Sequence[str], body: Body) -> dict[str, Place]:
     return max(({n: p for n, p in table.items() if p in known} for table in tables), key=len)
 
 
-def _read(entry: PoseEntry, name: str, cameras: TakeCameras) -> PoseRecording:
+def _read_poses(entry: PoseEntry, name: str, cameras: TakeCameras) -> PoseRecording:
     found, take = read_poses(entry.file, person=entry.person), cameras.take
     for joint in entry.joints:
         check_choice("joint", joint, found.names, ObservationError, file=entry.file, remedy="Correct joints.")
@@ -248,7 +361,7 @@ def _read(entry: PoseEntry, name: str, cameras: TakeCameras) -> PoseRecording:
     )  # fmt: skip
 
 
-def _sensor(entry: PoseEntry, recording: PoseRecording, body: Body) -> PoseSensor:
+def _pose_sensor(entry: PoseEntry, recording: PoseRecording, body: Body) -> PoseSensor:
     known = {*body.landmarks.names, *body.tree.segments}
     points = entry.joints or {
         n: p for n, p in (recording.points or places_of(recording.names, body)).items()
@@ -281,7 +394,7 @@ def _propose(files: Sequence[Path]) -> Iterator[Proposal]:
             yield Proposal({"file": file}, reason)
 
 
-KIND = SensorKind(
+POSES = SensorKind(
     table="pose", summary="joints in space that another program estimated: a second opinion", label="poses",
-    entry=PoseEntry, read=_read, sensor=_sensor, propose=_propose, finds_pose=True,
+    entry=PoseEntry, read=_read_poses, sensor=_pose_sensor, propose=_propose, finds_pose=True,
 )  # fmt: skip

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +31,27 @@ from kinefit.solving.rows import AnyRows, DofRows
 
 _REFERENCE_DISTANCE_M = TrackSettings.near  # [m] correspondence distance at which the loss holds as it is
 _LEVER = 0.1  # [m] of the points that show an orientation to a start
+
+
+Place = str | tuple[str, ...]
+"""A landmark of the body, a segment, whose origin it then is, or landmarks of one segment, in whose middle it is."""
+
+
+@lru_cache(maxsize=256)
+def places_on(body: Body, what: str, names: tuple[str, ...], places: tuple[Place, ...]) -> PointSet:
+    """(K,) points of a body at places; BodyError for a place that it does not have, of `what`, such as a "tracker"."""
+    segments, x = list[int](), list[NDArray]()
+    for name, place in zip(names, places):
+        own = (place,) if isinstance(place, str) else place
+        if all(one in body.landmarks.names for one in own):
+            at = body.landmarks.select(own)
+            segments, x = [*segments, int(at.segments[0])], [*x, at.points.mean(axis=0)]
+        elif len(own) == 1 and own[0] in body.tree.segments:
+            segments, x = [*segments, body.tree.segment(own[0])], [*x, np.zeros(3)]
+        else:
+            problem = choices("landmark or segment", ", ".join(own), [*body.landmarks.names, *body.tree.segments])
+            raise BodyError(f"{what} '{name}': {problem}", remedy="Give a landmark or segment of the body.")
+    return PointSet(names, np.array(segments, np.int64), np.reshape(x, (-1, 3)))
 
 
 class BodyTrackerSensor(Sensor):
@@ -86,18 +108,7 @@ class BodyTrackerSensor(Sensor):
 
     def places(self, body: Body, names: Sequence[str]) -> PointSet:
         """(K,) where trackers are on a body: its landmarks, else origins of its segments; else BodyError."""
-        segments, x = list[int](), list[NDArray]()
-        for name in names:
-            at = self.points[name]
-            if at in body.landmarks.names:
-                k = body.landmarks.index(at)
-                segments, x = [*segments, int(body.landmarks.segments[k])], [*x, body.landmarks.points[k]]
-            elif at in body.tree.segments:
-                segments, x = [*segments, body.tree.segment(at)], [*x, np.zeros(3)]
-            else:
-                problem = choices("landmark or segment", at, [*body.landmarks.names, *body.tree.segments])
-                raise BodyError(f"tracker '{name}': {problem}", remedy="Give a landmark or segment of the body.")
-        return PointSet(tuple(names), np.array(segments, int), np.reshape(x, (-1, 3)))
+        return places_on(body, "tracker", tuple(names), tuple(self.points[name] for name in names))
 
     def mounted(self, names: Sequence[str], scene: Scene) -> NDArray:
         """(K, 3, 3) rotations from the axes of trackers to those of their segments, as the scene has them."""

@@ -23,7 +23,7 @@ from kinefit.sensors.points import views
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.visibility.occlusion import MIN_VISIBLE_CONFIDENCE, Hidden, hidden_points
 from kinefit.solving.correspondences import _kernels
-from kinefit.solving.pixels import PixelPoints
+from kinefit.solving.least_squares import PixelPoints
 from kinefit.solving.rows import AnyRows
 
 Stream = tuple[str, str, tuple[str, ...]]
@@ -405,3 +405,9 @@ def keypoint_sigma(keypoints: Sequence[Keypoints], sigma: Mapping[str, float], d
 def pixels_of(matched: Iterable[Matched]) -> list[KeypointMatched]:
     """The matches of image points: packed blocks for compiled fits and the smoother."""
     return [m for m in matched if isinstance(m, KeypointMatched)]
+
+
+def pixels_and_others(matched: Sequence[Matched]) -> tuple[list[KeypointMatched], list[Matched]]:
+    """The matches of image points, and all others."""
+    pixels = pixels_of(matched)
+    return pixels, [m for m in matched if m not in pixels]

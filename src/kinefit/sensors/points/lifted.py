@@ -78,13 +78,18 @@ class OnBody:
     length: NDArray
 
 
+def long_bones(body: Body, points: PointSet) -> list[tuple[int, int, int, float]]:
+    """Those of `rigid_pairs` of points of a body that are long, beside the longest."""
+    pairs = rigid_pairs(body, points)
+    longest = max((pair[3] for pair in pairs), default=0.0)
+    return [pair for pair in pairs if pair[3] > MIN_BONE_SHARE * longest]
+
+
 @lru_cache(maxsize=64)
 def _on(body: Body, keypoint_set: str, names: tuple[str, ...]) -> OnBody:
     known = known_points(body, keypoint_set)
     points, middle = known.select(names), body.points_rest(known.select(HIPS)).mean(axis=0)
-    pairs = rigid_pairs(body, points)
-    longest = max((pair[3] for pair in pairs), default=0.0)
-    pairs = [pair for pair in pairs if pair[3] > MIN_BONE_SHARE * longest]
+    pairs = long_bones(body, points)
     first, second = (np.array([pair[k] for pair in pairs], np.int64) for k in (0, 1))
     hips = PointSet(("hips",), np.zeros(1, np.int64), middle[None] - body.tree.rest[0])
     both = PointSet(

@@ -17,22 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
-from kinefit.bodies.limbs import rigid_pairs
 from kinefit.bodies.motion import UP_AXES
-from kinefit.errors import BodyError, ObservationError, choices
+from kinefit.errors import ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.losses import Loss
 from kinefit.observations import BodyTrackerFrame
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor, Unknown, of_kind
-from kinefit.sensors.points.lifted import MIN_BONE_SHARE
+from kinefit.sensors.points.body_trackers import Place, places_on
+from kinefit.sensors.points.lifted import long_bones
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import MARKER_LOSS, TrackSettings
 from kinefit.solving.correspondences import _kernels
 from kinefit.solving.equations import design
 from kinefit.solving.rows import AnyRows, DofRows
-
-Place = str | tuple[str, ...]
-"""A landmark of the body, a segment, whose origin it then is, or landmarks of one segment, in whose middle it is."""
 
 HIPS = ("thigh_l", "thigh_r", "l_hip", "r_hip")
 """Places of the body whose middle joints are counted from."""
@@ -165,7 +162,7 @@ class PoseSensor(Sensor):
 
     def places(self, body: Body, names: Sequence[str]) -> PointSet:
         """(K,) where joints are on a body; BodyError for a place that it does not have."""
-        return _places(body, tuple(names), tuple(self.points[name] for name in names))
+        return places_on(body, "joint", tuple(names), tuple(self.points[name] for name in names))
 
     def offsets(self, names: Sequence[str], scene: Scene) -> NDArray:
         """(K, 3) [m] offsets of joints in the frames of their segments; of left and right one is the other's mirror."""
@@ -196,29 +193,12 @@ def _kind(place: Place) -> tuple[str, int]:
 
 
 @lru_cache(maxsize=256)
-def _places(body: Body, names: tuple[str, ...], places: tuple[Place, ...]) -> PointSet:
-    segments, x = list[int](), list[NDArray]()
-    for name, place in zip(names, places):
-        own = (place,) if isinstance(place, str) else place
-        if all(one in body.landmarks.names for one in own):
-            at = body.landmarks.select(own)
-            segments, x = [*segments, int(at.segments[0])], [*x, at.points.mean(axis=0)]
-        elif len(own) == 1 and own[0] in body.tree.segments:
-            segments, x = [*segments, body.tree.segment(own[0])], [*x, np.zeros(3)]
-        else:
-            problem = choices("landmark or segment", ", ".join(own), [*body.landmarks.names, *body.tree.segments])
-            raise BodyError(f"joint '{name}': {problem}", remedy="Give a landmark or segment of the body.")
-    return PointSet(names, np.array(segments, int), np.reshape(x, (-1, 3)))
-
-
-@lru_cache(maxsize=256)
 def _size(
     body: Body, points: tuple[tuple[str, Place], ...], lengths: tuple[tuple[tuple[str, str], float], ...]
 ) -> float:
     names, known = tuple(name for name, _ in points), dict(lengths)
-    pairs = rigid_pairs(body, _places(body, names, tuple(place for _, place in points)))
-    longest = max((pair[3] for pair in pairs), default=0.0)
-    both = [(p[3], known.get((names[p[0]], names[p[1]]), np.nan)) for p in pairs if p[3] > MIN_BONE_SHARE * longest]
+    bones = long_bones(body, places_on(body, "joint", names, tuple(place for _, place in points)))
+    both = [(length, known.get((names[a], names[b]), np.nan)) for a, b, _, length in bones]
     ours, theirs = np.reshape([pair for pair in both if np.isfinite(pair[1])], (-1, 2)).T
     return float(np.sqrt(ours @ ours / (theirs @ theirs))) if len(ours) else 1.0
 

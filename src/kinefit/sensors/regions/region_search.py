@@ -141,9 +141,7 @@ def seek(
     whole = max(float(np.maximum(ratios, 0.0).sum()), 1e-9)
 
     def poses(p: NDArray) -> NDArray:
-        out = np.tile(np.eye(4), (len(p), 1, 1))
-        out[:, :3, :3], out[:, :3, 3] = se3.exp_so3(p[:, 3:]), middle + p[:, :3]
-        return out
+        return se3.transform(se3.exp_so3(p[:, 3:]), middle + p[:, :3])
 
     def value(p: NDArray) -> NDArray:
         sums, _ = seeker.explained(x, poses(p), lens, ratios)
@@ -170,9 +168,7 @@ def seek(
     width = np.minimum(0.5 * spread, [cell, cell, 0.05 * middle[2], 0.3, 0.3, 0.3])
     ends = [_improved(value, pool[k], float(values[k]), width, s) for k in np.argsort(-values)[: s.best]]
     ends.sort(key=lambda end: -end[1])
-    back = np.eye(4)
-    back[:3, 3] = -middle
-    return np.asarray(poses(np.array([p for p, _ in ends[: s.starts]])) @ back)
+    return np.asarray(poses(np.array([p for p, _ in ends[: s.starts]])) @ se3.transform(np.eye(3), -middle))
 
 
 def _improved(

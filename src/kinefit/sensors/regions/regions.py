@@ -27,11 +27,11 @@ from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segm
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.regions.region_parts import OTHER, SEAM_SPACING_PX, Coloured, Drawn, Lines, Parts, Seams, kept
 from kinefit.sensors.regions.region_search import Starts
+from kinefit.sensors.regions.silhouette import contour_rows
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.solving.correspondences.contours.morphed import morphed_outline_rows
-from kinefit.solving.correspondences.contours.outlines import Rim, outline_rows
-from kinefit.solving.rows import AnyRows
+from kinefit.solving.correspondences.contours.outlines import Rim
+from kinefit.solving.rows import AnyRows, weighted
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +62,8 @@ class RegionMatched(Matched):
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """One row a line: the body's point should project onto the image's contour; one row a seam point."""
         seams = [] if self.seams is None else [self.seams.rows(scene, self.off, self.sure, self.loss)]
-        camera = scene.placed(self.measurement.of.camera)
-        if not scene.surface.morphing.is_rigid:
-            blended = morphed_outline_rows(scene.pose, self.rim, camera, self.place, sigma=1.0)
-            return [replace(blended, weight=blended.weight * self.weight[blended.group], loss=self.loss), *seams]
-        state, x = scene.state, scene.pose.vertices
-        rows = outline_rows(scene.body, state, self.rim, x, camera, self.place, sigma=1.0)
-        rows.data[7] *= self.weight[rows.group]
-        return [replace(rows, loss=self.loss), *seams]
+        rows = contour_rows(scene, self.rim, scene.placed(self.measurement.of.camera), self.place, 1.0)
+        return [replace(weighted(rows, rows.weight * self.weight[rows.group]), loss=self.loss), *seams]
 
     def evidence(self, scene: Scene) -> Evidence:
         """Share of each segment's contour at which the colours change as expected, and at which they do not."""

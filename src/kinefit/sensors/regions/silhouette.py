@@ -22,9 +22,8 @@ from kinefit.sensors.evidence import AGREEMENT_SIGMAS, Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.visibility.occlusion import drawn_together, outside_others
-from kinefit.solving.correspondences.contours.morphed import morphed_outline_rows
-from kinefit.solving.correspondences.contours.outlines import Rim, outline_pairs, outline_rows
-from kinefit.solving.rows import AnyRows
+from kinefit.solving.correspondences.contours.outlines import Rim, morphed_outline_rows, outline_pairs, outline_rows
+from kinefit.solving.rows import AnyRows, DofRows, Rows
 
 _MAX_RENDER_SHIFT_PX = 0.5  # of a body since its rendering: half of the offset at which pixels at the contour are read
 _FOREARM_RADIUS = 0.04  # [m]: a contour farther off is another part's, however poor the masks are
@@ -49,6 +48,13 @@ def averaged(mask: NDArray, size: tuple[int, int]) -> NDArray:
         if mask.shape != step[::-1]:
             mask = cv2.resize(mask, step, interpolation=cv2.INTER_AREA)
     return mask
+
+
+def contour_rows(scene: Scene, rim: Rim, camera: Camera, tangents: NDArray, sigma: float) -> Rows | DofRows:
+    """One row a point of a body's contour: it should project onto its tangent (4, N) of the image's, sigma [px]."""
+    if scene.surface.morphing.is_rigid:
+        return outline_rows(scene.body, scene.state, rim, scene.pose.vertices, camera, tangents, sigma=sigma)
+    return morphed_outline_rows(scene.pose, rim, camera, tangents, sigma=sigma)
 
 
 class SilhouetteSensor(Sensor):
@@ -210,13 +216,7 @@ class SilhouetteMatched(Matched):
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """One row a pair: the body's point should project onto the tangent of the image's contour."""
         camera = scene.placed(self.measurement.camera)
-        if scene.surface.morphing.is_rigid:
-            rows = outline_rows(
-                scene.body, scene.state, self.rim, scene.pose.vertices, camera, self.tangents, sigma=self.row_sigma
-            )  # fmt: skip
-            return [replace(rows, loss=self.loss)]
-        blended = morphed_outline_rows(scene.pose, self.rim, camera, self.tangents, sigma=self.row_sigma)
-        return [replace(blended, loss=self.loss)]
+        return [replace(contour_rows(scene, self.rim, camera, self.tangents, self.row_sigma), loss=self.loss)]
 
     def evidence(self, scene: Scene) -> Evidence:
         """Share of each segment's contour with a silhouette's contour along it, and share without."""

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.sensors.surfaces import _kernels_depth_view as kernels
 
@@ -199,11 +200,9 @@ def camera_at(x_world: NDArray, viewpoint: NDArray | None) -> Camera:
     z = (middle - eye) / max(float(np.linalg.norm(middle - eye)), 1e-9)
     x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
     x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z])
-    T[:3, 3] = -T[:3, :3] @ eye
+    R = np.stack([x, np.cross(z, x), z])
     K = np.array([[_CLOUD_FOCAL_PX, 0, 319.5], [0, _CLOUD_FOCAL_PX, 319.5], [0, 0, 1.0]])
-    return Camera("cloud", (640, 640), K, T_camera_world=T)
+    return Camera("cloud", (640, 640), K, T_camera_world=se3.transform(R, -R @ eye))
 
 
 _CELL_COLUMNS = 320  # finer cells cost more, and a wrist at 3 m is four wide

@@ -21,7 +21,7 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surfaces.depth_view import camera_at, splat, view_of
 from kinefit.solving.correspondences import anchored_rows, free_space_rows, surface_rows, target_rows
-from kinefit.solving.correspondences.contours.morphed import on_moved_joints
+from kinefit.solving.correspondences.contours.outlines import on_moved_joints
 from kinefit.solving.correspondences.occupancy.free_space import FreeSpace, SurfaceSamples
 from kinefit.solving.correspondences.surfaces import anchored
 from kinefit.solving.rows import AnyRows, DofRows, Rows

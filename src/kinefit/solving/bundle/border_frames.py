@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.geometry.losses import SQUARED, Loss
-from kinefit.solving import _kernels_border, _kernels_linear
+from kinefit.solving import _kernels_linear
 from kinefit.solving.bundle.arrow import MIN_DIAGONAL_RATIO
 from kinefit.solving.equations import columns, dense_pattern, lock, normal_equations, residuals, robust_factors
-from kinefit.solving.least_squares import Damping, bounds_of, descend
-from kinefit.solving.pixels import fit_pixels
+from kinefit.solving.least_squares import Damping, bounds_of, descend, fit_pixels
 from kinefit.solving.rows import AnyRows, DofRows, Rows
 
 POSTURE_SHARE = 0.01
@@ -308,7 +307,7 @@ def _floor(H: NDArray) -> float:
 def gram(A: NDArray, B: NDArray) -> NDArray:
     """Aᵀ B (n, m) of matrices (N, n) and (N, m), without threads."""
     out = np.zeros((A.shape[1], B.shape[1]))
-    _kernels_border.gram(np.ascontiguousarray(A), np.ascontiguousarray(B), out)
+    _kernels_linear.gram(np.ascontiguousarray(A), np.ascontiguousarray(B), out)
     return out
 
 

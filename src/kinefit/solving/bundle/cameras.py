@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.solving.bundle import _kernels_cameras
-from kinefit.solving.bundle._kernels_cameras import COLUMNS
+from kinefit.solving.bundle import _kernels
+from kinefit.solving.bundle._kernels import COLUMNS
 from kinefit.solving.bundle.arrow import Arrow
 
 POSE, FOCAL, ASPECT, CENTRE, RADIAL, DISTORTION = slice(0, 6), 6, 7, slice(8, 10), slice(10, 12), slice(10, 15)
@@ -152,7 +152,7 @@ def pixel_rows(
     value, by_camera, by_point = np.empty((M, 2)), np.empty((M, 2, COLUMNS)), np.empty((M, 2, 3))
     motion = np.zeros(uv.shape) if motion is None else motion
     x = np.ascontiguousarray(x_world, float)
-    _kernels_cameras.point_systems(rig.packed, camera, x, motion, value, by_point, by_camera)
+    _kernels.point_systems(rig.packed, camera, x, motion, value, by_point, by_camera)
     out = np.empty((M, 2, len(used) + (3 if by_block is None else by_block.shape[2]) + 1))
     out[..., : len(used)], out[..., -1] = by_camera[..., used], uv - value
     out[..., len(used) : -1] = by_point if by_block is None else by_point @ by_block

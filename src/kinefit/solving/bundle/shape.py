@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.losses import Loss, geman_mcclure
-from kinefit.solving.bundle import _kernels_shape
+from kinefit.solving.bundle import _kernels
 from kinefit.solving.bundle.adjust import BundleProblem, BundleState
 from kinefit.solving.bundle.arrow import Arrow, Blocks, assembled
 from kinefit.solving.bundle.border_frames import POSTURE_SHARE
@@ -131,7 +131,7 @@ class ShapeParameters:
         first = tree.n_dofs + len(self.mean)
         size = first + place.max(initial=-1) + 1
         H, g = np.zeros((size, size)), np.zeros(size)
-        cost = _kernels_shape.frame_system(
+        cost = _kernels.frame_system(
             tree.parents, tree.dof_parent, tree.last_dof, tree.offsets, body.segment_scale, len(body.scale_groups),
             self.points.segments, rest, self.points.points, self.shift, self.mirror, rig.packed, pixels.camera,
             pixels.column, pixels.uv[f], pixels.weight[f], pixels.share, placed, screws,

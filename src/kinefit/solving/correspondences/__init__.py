@@ -1,8 +1,12 @@
 """Row makers: observations and a body at a state to linearised measurements, one file for each kind."""
 
 from kinefit.solving.correspondences.closures import Bands, band_rows, closure_rows, coincidence_rows, joint_bands
-from kinefit.solving.correspondences.contours.morphed import morphed_outline_rows, morphed_rows
-from kinefit.solving.correspondences.contours.outlines import outline_pairs, outline_rows
+from kinefit.solving.correspondences.contours.outlines import (
+    morphed_outline_rows,
+    morphed_rows,
+    outline_pairs,
+    outline_rows,
+)
 from kinefit.solving.correspondences.occupancy.free_space import collision_rows, depth_image_rows, free_space_rows
 from kinefit.solving.correspondences.points import (
     edge_rows,

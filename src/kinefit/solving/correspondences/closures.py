@@ -30,7 +30,7 @@ from kinefit.bodies.parts import has_unknown_gear, with_dimensions
 from kinefit.bodies.tree import Closure
 from kinefit.errors import BodyError, ObservationError, check_choice
 from kinefit.geometry import se3
-from kinefit.solving.correspondences import _kernels_closures, targets
+from kinefit.solving.correspondences import _kernels, targets
 from kinefit.solving.rows import DofRows, PairRows
 
 HARD_SIGMA = 1e-4
@@ -72,7 +72,7 @@ class Closed:
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """Closures of a body as arrays for `_kernels_closures.close`: K closures, m equations."""
+    """Closures of a body as arrays for `_kernels.close`: K closures, m equations."""
 
     segments: NDArray
     rest: NDArray
@@ -138,7 +138,7 @@ def _closed(body: Body, state: BodyState, lines: int) -> tuple[NDArray, NDArray]
     t, tree = _table(body), body.tree
     frames, screws = tree.forward(state.T_world_root, state.angles)
     value, J = np.empty(len(t.owner)), np.zeros((lines, tree.n_dofs))
-    _kernels_closures.close(
+    _kernels.close(
         frames, screws, np.ascontiguousarray(state.T_world_root[:3, 3]), t.segments, t.rest, t.directions, t.first,
         t.rigid, t.turns, tree.dof_parent, tree.last_dof, value, J,
     )  # fmt: skip
@@ -218,28 +218,33 @@ def every_closure(body: Body, state: BodyState) -> list[DofRows]:
 
 
 @dataclass(frozen=True, eq=False)
-class HardEquations:
-    """The closure equations that hold exactly.
+class ClosureEquations:
+    """Some of the closure equations of a body, as a function of its state.
 
     Parameters
     ----------
     body : Body
-    hard : (m,) bool, which of the body's equations hold exactly
+    chosen : (m,) bool, which of the body's equations
     """
 
     body: Body
-    hard: NDArray
+    chosen: NDArray
 
     def __call__(self, state: BodyState) -> tuple[NDArray, NDArray]:
         """Values (h,) [m, rad] and Jacobian (h, n) at a state."""
         closed = closed_at(self.body, state)
-        return closed.value[self.hard], closed.jacobian[self.hard]
+        return closed.value[self.chosen], closed.jacobian[self.chosen]
 
 
-def hard_equations(body: Body) -> HardEquations | None:
-    """Function of a state: values and Jacobian of the hard closures; None without hard closures."""
+def every_equation(body: Body) -> ClosureEquations:
+    """All equations of the closures, soft ones too."""
+    return ClosureEquations(body, np.ones(len(owners(body)), bool))
+
+
+def hard_equations(body: Body) -> ClosureEquations | None:
+    """The equations of the hard closures, which hold exactly; None without hard closures."""
     hard = np.hypot(_table(body).sigma, _gear_sigma(body)) == 0.0 if body.closures else np.zeros(0, bool)
-    return HardEquations(body, hard) if hard.any() else None
+    return ClosureEquations(body, hard) if hard.any() else None
 
 
 @lru_cache(maxsize=64)

@@ -16,8 +16,6 @@ from kinefit.bodies.surfaces.places import nearest_lines
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.solving.correspondences import _kernels, targets
-from kinefit.solving.correspondences import _kernels_surface as kernels
-from kinefit.solving.correspondences._kernels_surface import surface_rows as fill
 from kinefit.solving.rows import Rows
 
 
@@ -66,7 +64,7 @@ def surface_rows(
     lines = targets.lines(x)
     distance, normal, owner = nearest_lines(body, frames, lines, max_distance, segment, exact=exact)
     data, owners, group = _kernels.buffers(len(x))
-    count = fill(lines, distance, normal, owner, weight, eye, min_facing, data, owners, group)
+    count = _kernels.surface_rows(lines, distance, normal, owner, weight, eye, min_facing, data, owners, group)
     return Rows(np.ascontiguousarray(data[:, :count]), owners[:count], group[:count])
 
 
@@ -137,7 +135,7 @@ def anchored_rows(
     x, measured = _checked(points, count), _checked(x_world, count)
     w = np.ascontiguousarray(np.broadcast_to(np.asarray(weight, float), count))
     data = np.empty((8, count))
-    kernels.anchored_rows(frames, segment, x, _checked(normals, count), measured, w, at_surface, data)
+    _kernels.anchored_rows(frames, segment, x, _checked(normals, count), measured, w, at_surface, data)
     return Rows(data, segment, np.arange(count))
 
 
@@ -150,7 +148,7 @@ def anchored(rows: Rows, x_world: NDArray, frames: NDArray) -> tuple[NDArray, ND
     frames : (S, 12) of the state of the match.
     """
     x, rest, normal = np.empty((3, len(rows), 3))
-    kernels.anchors(rows.data, rows.segment, rows.group, frames, _checked(x_world, len(x_world)), x, rest, normal)
+    _kernels.anchors(rows.data, rows.segment, rows.group, frames, _checked(x_world, len(x_world)), x, rest, normal)
     return x, rest, normal
 
 
@@ -185,7 +183,7 @@ def target_rows(
         raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive number of pixels.")
     count = len(segment)
     data, x, pixel = np.empty((8, count)), _checked(points, count), _checked(target, count, 2)
-    kernels.target_rows(frames, segment, x, camera.packed, pixel, slack, 1.0 / sigma**2, data)
+    _kernels.target_rows(frames, segment, x, camera.packed, pixel, slack, 1.0 / sigma**2, data)
     return Rows(data, segment, np.arange(count))
 
 

@@ -25,7 +25,7 @@ from kinefit.fitting.smoothing.unwrap import boxes, continued
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Matched, Measurement, matched_by, of_kind
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.points.keypoints import KeypointMatched, pixels_of
+from kinefit.sensors.points.keypoints import KeypointMatched, pixels_and_others, pixels_of
 from kinefit.sensors.scene import Scene
 from kinefit.solving.closed import on_null_space, onto
 from kinefit.solving.correspondences.closures import every_closure, hard_equations, looped
@@ -109,7 +109,8 @@ class FrameCosts:
 
     def _rows(self, matched: Sequence[Matched], scene: Scene, points: Sequence[Matched] = ()) -> list[AnyRows]:
         """Rows of matches; `points` are all matches of points of the frame, which decide how surfaces count."""
-        weighted = [self._with_known_noise(m) if isinstance(m, KeypointMatched) else m for m in matched]
+        pixels, others = pixels_and_others(matched)
+        weighted = [*map(self._with_known_noise, pixels), *others]
         count = rows_of_points(scene, [m for m in points if m not in matched])
         return rows_of(scene, weighted, self.tracker.settings, self.noise.scale, points=count)
 

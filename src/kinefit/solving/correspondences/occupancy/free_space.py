@@ -22,7 +22,6 @@ from kinefit.bodies.surfaces import MeshSurface, TaperedCylinder
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.solving.correspondences import _kernels
-from kinefit.solving.correspondences.occupancy import _kernels_depth_image
 from kinefit.solving.correspondences.occupancy import _kernels_space as kernels
 from kinefit.solving.correspondences.targets import check_depth_image
 from kinefit.solving.rows import PairRows, Rows
@@ -91,7 +90,7 @@ def depth_image_rows(
     if not sigma > 0:
         raise ObservationError(f"the standard deviation of a depth image is {sigma} m", remedy="Give positive metres.")
     data, segment, group = _kernels.buffers(len(samples))
-    end = _kernels_depth_image.depth_image_rows(
+    end = kernels.depth_image_rows(
         frames, samples.segment, samples.point, samples.normal, camera.packed, depth, camera.ray_table, shown,
         shown.shape[1] / camera.size[0], _VISIBILITY_MARGIN, reach, facing, 1.0 / sigma**2, data, segment, group, 0,
     )  # fmt: skip
