@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.geometry.se3 import nearest_rotation
+from kinefit.geometry.se3 import aligned
 
 MIN_COARSE_POINTS = 6
 """Points of a segment that is matched by the coarse update (P5: "our threshold is 6")."""
@@ -71,16 +71,10 @@ def candidate_table(
     return CandidateTable(order, columns)
 
 
-def motion(x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
-    """Rigid motion of points x (N, 3) onto y (N, 3) [m] by SVD, (1) (Arun et al.): R (3, 3), t (3,) [m]."""
-    a, b = x.mean(0), y.mean(0)
-    R = nearest_rotation((y - b).T @ (x - a))
-    return R, b - R @ a
-
-
 def errors(x: NDArray, y: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Errors (N,) [m] of points x (N, 3) against y (N, 3) under the best motion; R, t."""
-    R, t = motion(x, y)
+    """Errors (N,) [m] of points x (N, 3) against y (N, 3) under the best motion by SVD, (1) (Arun et al.); R, t."""
+    T = aligned(x, y)
+    R, t = T[:3, :3], T[:3, 3]
     return np.linalg.norm(y - x @ R.T - t, axis=1), R, t
 
 

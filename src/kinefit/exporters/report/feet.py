@@ -27,7 +27,7 @@ MIN_STRIDE_S = 0.4  # [s]: sprinters take 0.45 s
 BELT_STD = 0.013  # [m/s] of a belt's velocity: the root mean square in ten walks of four people, as if on a belt
 HEEL, BALL, TOE = "heel", ("metatarsal_phalanx_1", "metatarsal_phalanx_5"), "digit_1"  # of a foot, after "l_", "r_"
 _CONTACT_SHARE, _OFF_SHARE = 0.1, 0.18  # of the swing's highest speed: no error against plates in the mean of five
-# people (HC002D, HC036A and HC050A, the adult and the sprinter of forces_nimblephysics), each of whom counts once
+# people (HC002D, HC036A and HC050A, the adult and the sprinter of forces_nimblephysics); each person counts once
 _CONTACT_STD_S, _OFF_STD_S = 0.013, 0.0105  # of the next person: 7.8 and 5.5 ms between these people, as Student's t
 # of five predicts another, 5.6 and 6.5 ms within one
 _MARKED_STD_S = 0.009  # of laboratories' own events: they differ by 12.5 ms from ours, which are right to 8.5 ms, there
