@@ -126,7 +126,7 @@ def nearest_frame(times: NDArray, time: float, rate: float) -> int | None:
     return frame if abs(times[frame] - time) < 1.0 / rate else None
 
 
-def _turned_std(std: NDArray, R: NDArray, rays: NDArray | None = None) -> NDArray:
+def turned_std(std: NDArray, R: NDArray, rays: NDArray | None = None) -> NDArray:
     """(..., 3) standard deviations along new axes; of errors along rays (..., 3) in the old ones, or along its axes."""
     var = np.square(std)
     finite = np.isfinite(var)
@@ -390,10 +390,10 @@ class Motion:
             if r.unit == "m" and r.values.shape[-1] == 3 else r
             for name, r in self.residuals.items()
         }  # fmt: skip
-        shift = _turned_std(self.dof_std[:, :3], R, None if rays is None else rays[:, 0])
-        turn = _turned_std(self.dof_std[:, 3:6], R)
+        shift = turned_std(self.dof_std[:, :3], R, None if rays is None else rays[:, 0])
+        turn = turned_std(self.dof_std[:, 3:6], R)
         return replace(
-            self, Ts_world_root=roots, joint_std=_turned_std(self.joint_std, R, rays), residuals=residuals,
+            self, Ts_world_root=roots, joint_std=turned_std(self.joint_std, R, rays), residuals=residuals,
             dof_std=np.concatenate([shift, turn, self.dof_std[:, 6:]], axis=1),
             lasting=self.lasting and self.lasting.turned(R), plates=tuple(p.moved(T_new_world) for p in self.plates),
         )  # fmt: skip
