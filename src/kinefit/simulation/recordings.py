@@ -8,6 +8,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -126,24 +127,34 @@ def write_recording(
         farthest = max(cameras, key=lambda camera: float(np.linalg.norm(camera.centre_world - middle)))
         scene = SimulatedScene(motion, scene.mesh, room_around(motion, farthest))
     job = _Job(scene, Rig(tuple(cameras)), seed, step or (lambda what, done, total: None))
+    remedy = "Give a folder that can be written, on a disk with free space."
+    with _staged(folder, "the recording cannot be written", remedy) as staging:
+        entries = [entry for sensor in chosen for entry in _write_sensor(job, sensor, chosen, staging)]
+        write_calibration(job.rig, staging / "calibration.toml")
+        _save(staging / "preview.png", preview(job.scene, job.rig, seed=seed))
+        text = _take_text(_TITLE, motion, entries, str(body or motion.body.name))
+        (staging / "take.toml").write_text(text, encoding="utf-8")
+        if beside is not None:
+            beside(staging)
+    return folder / "take.toml"
+
+
+@contextmanager
+def _staged(folder: Path, problem: str, remedy: str) -> Iterator[Path]:
+    """Give a temporary folder, whose files move into `folder` when the block ends well.
+
+    Raises
+    ------
+    ExportError
+        The problem and its remedy, where the system refuses.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
-            staging = Path(name)
-            entries = [entry for sensor in chosen for entry in _write_sensor(job, sensor, chosen, staging)]
-            write_calibration(job.rig, staging / "calibration.toml")
-            _save(staging / "preview.png", preview(job.scene, job.rig, seed=seed))
-            text = _take_text(_TITLE, motion, entries, str(body or motion.body.name))
-            (staging / "take.toml").write_text(text, encoding="utf-8")
-            if beside is not None:
-                beside(staging)
-            _move(staging, folder)
+            yield Path(name)
+            _move(Path(name), folder)
     except OSError as error:  # PyAV's file errors are OSErrors too
-        raise ExportError(
-            f"the recording cannot be written ({error.strerror or error})", file=folder,
-            remedy="Give a folder that can be written, on a disk with free space.",
-        ) from error
-    return folder / "take.toml"
+        raise ExportError(f"{problem} ({error.strerror or error})", file=folder, remedy=remedy) from error
 
 
 def _cameras(
@@ -316,25 +327,16 @@ def write_synthetic_take(folder: str | os.PathLike[str], motion: Motion | None =
     goes_far = np.argmax(high - low) != "xyz".index(motion.up[-1])
     rig = studio_rig(motion, size=_IMAGE_SIZE[::-1] if goes_far else _IMAGE_SIZE)
     detections = simulate_keypoints(motion, rig, "MEDIAPIPE_33", noise_px=1.5, outliers=0.05, missing=0.05, seed=seed)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
-            staging = Path(name)
-            entries = [f'[[camera]]\nname = "{camera}"\nvideo = "{camera}.mp4"\n' for camera in rig.names]
-            for camera, keypoints in zip(rig, detections):
-                figures = (draw_figure(motion, frame, camera) for frame in range(len(motion)))
-                write_video(staging / f"{camera.name}.mp4", figures, motion.rate, camera.size)
-                entries.append(_write_landmarks(keypoints, staging))
-            write_calibration(rig, staging / "calibration.toml")
-            text = _take_text(_FOUR_CAMERAS, motion, entries, motion.body.name)
-            (staging / "take.toml").write_text(text, encoding="utf-8")
-            for path in sorted(staging.iterdir(), key=lambda path: path.name == "take.toml"):
-                path.replace(folder / path.name)
-    except OSError as error:  # PyAV's file errors are OSErrors too
-        raise ExportError(
-            f"the synthetic take cannot be written ({error.strerror or error})", file=folder,
-            remedy="Give a folder that can be written, on a disk with 10 MB free.",
-        ) from error
+    remedy = "Give a folder that can be written, on a disk with 10 MB free."
+    with _staged(folder, "the synthetic take cannot be written", remedy) as staging:
+        entries = [f'[[camera]]\nname = "{camera}"\nvideo = "{camera}.mp4"\n' for camera in rig.names]
+        for camera, keypoints in zip(rig, detections):
+            figures = (draw_figure(motion, frame, camera) for frame in range(len(motion)))
+            write_video(staging / f"{camera.name}.mp4", figures, motion.rate, camera.size)
+            entries.append(_write_landmarks(keypoints, staging))
+        write_calibration(rig, staging / "calibration.toml")
+        text = _take_text(_FOUR_CAMERAS, motion, entries, motion.body.name)
+        (staging / "take.toml").write_text(text, encoding="utf-8")
     return folder / "take.toml"
 
 
