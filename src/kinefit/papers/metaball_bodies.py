@@ -25,19 +25,8 @@ from kinefit.fitting.subject.fit import fit_subject
 from kinefit.fitting.subject.metaballs import ROUNDS, MetaballShape, fit_field, grown, unmeshed
 from kinefit.geometry.camera import Rig
 from kinefit.observations import PointCloud
-from kinefit.papers._metaball_steps import (
-    AS_PRINTED,
-    MetaballBody,
-    MetaballHelps,
-    OtherRows,
-    check_influence,
-    lowest_of_neighbours,
-    points_of_limb,
-    pose_rows,
-    rms_distance,
-    shaped_body,
-    sigma_of_fields,
-)  # fmt: skip
+from kinefit.papers import _metaball_steps as steps
+from kinefit.papers._metaball_steps import AS_PRINTED, MetaballBody, MetaballHelps, OtherRows
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
@@ -89,8 +78,8 @@ def metaball_bodies(
     shape, poses, std, rounds = _alternating(
         body, limbs, points, states, sigma, iterations, tolerance, weights, locked, others, helps
     )
-    found = shaped_body(body, lambda limb: grown(limb, shape[limb.segment], weights=weights))
-    return MetaballBody(found, tuple(poses), std, rms_distance(found, poses, points), rounds)
+    found = steps.shaped_body(body, lambda limb: grown(limb, shape[limb.segment], weights=weights))
+    return MetaballBody(found, tuple(poses), std, steps.rms_distance(found, poses, points), rounds)
 
 
 def _alternating(
@@ -101,25 +90,25 @@ def _alternating(
     """Shape by segment (logarithms), poses, standard deviations by segment, rounds; see `metaball_bodies`."""
     fixed = None if locked is None else np.asarray(locked, bool)
     closest = [nearest(body, s, x, max_distance=helps.max_distance) for s, x in zip(states, points)]
-    of, sigmas = [n.segment for n in closest], sigma_of_fields(limbs, sigma, [n.normal for n in closest])
-    check_influence(body, points, states, of)
+    of, sigmas = [n.segment for n in closest], steps.sigma_of_fields(limbs, sigma, [n.normal for n in closest])
+    steps.check_influence(body, points, states, of)
     now, poses, std, rounds, swept = body, list(states), dict[str, NDArray](), 0, False
     shape = {limb.segment: np.zeros(limb.radii.size + len(limb.radii) * weights) for limb in limbs}
 
     def skeleton(k: int, start: BodyState) -> Fit:
-        rows = partial(pose_rows, now, k, points[k], of[k], sigmas[k], others, helps)
+        rows = partial(steps.pose_rows, now, k, points[k], of[k], sigmas[k], others, helps)
         return levenberg_marquardt(now, start, rows, loss=helps.loss, limits=helps.limits, locked=fixed)
 
     for _ in range(iterations):
         fits = [skeleton(k, pose) for k, pose in enumerate(poses)]
         if not swept:
-            own, fits = fits, lowest_of_neighbours(fits, skeleton)
+            own, fits = fits, steps.lowest_of_neighbours(fits, skeleton)
             swept = all(a is b for a, b in zip(own, fits))
         rounds, moved = rounds + 1, max(float(np.abs(p.difference(f.state)).max()) for p, f in zip(poses, fits))
         poses = [fit.state for fit in fits]
         frames = [now.tree.forward(s.T_world_root, s.angles)[0] for s in poses]
         for limb in limbs:
-            x, s = points_of_limb(body, limb.segment, frames, points, of, sigmas)
+            x, s = steps.points_of_limb(body, limb.segment, frames, points, of, sigmas)
             if len(x) < shape[limb.segment].size:
                 continue  # too few observations: the limb keeps its shape
             values, std[body.tree.segments[limb.segment]] = fit_field(
@@ -127,7 +116,7 @@ def _alternating(
             )  # fmt: skip
             moved = max(moved, float(np.abs(values - shape[limb.segment]).max()))
             shape[limb.segment] = values
-        now = shaped_body(body, lambda limb: unmeshed(limb, shape[limb.segment], weights))
+        now = steps.shaped_body(body, lambda limb: unmeshed(limb, shape[limb.segment], weights))
         if moved < tolerance:
             break
         if helps.reassign:  # without new meshes: fields may temporarily be too weak for one
@@ -143,8 +132,9 @@ def _joint(
     states = _alternating(body, limbs, points, states, sigma, _START_ROUNDS, 0.0)[1]
     sensor, shape = PointCloudSensor("points", sigma, TrackSettings()), MetaballShape(body, weights=weights)
     clouds = [PointCloud("points", 0.1 * k, x) for k, x in enumerate(points)]
-    steps = [[sensor.prepare(cloud, Scene(body, s, Rig(())))] for cloud, s in zip(clouds, states)]
-    found = fit_subject(body, Rig(()), steps, states, [shape], rounds=ROUNDS[0], coarse=ROUNDS[1])
+    seen = [[sensor.prepare(cloud, Scene(body, s, Rig(())))] for cloud, s in zip(clouds, states)]
+    found = fit_subject(body, Rig(()), seen, states, [shape], rounds=ROUNDS[0], coarse=ROUNDS[1])
     std, owner = np.sqrt(np.diag(found.covariance)), np.array([min(segments) for segments in shape.touches])
     of_limb = {body.tree.segments[k]: std[owner == k] for k in np.unique(owner)}
-    return MetaballBody(found.body, found.states, of_limb, rms_distance(found.body, found.states, points), found.rounds)
+    off = steps.rms_distance(found.body, found.states, points)
+    return MetaballBody(found.body, found.states, of_limb, off, found.rounds)
