@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.motion import Motion, rotation_between_up
 from kinefit.errors import ObservationError
-from kinefit.exporters.report.feet import BALL, HEEL, peaks, smoothed
+from kinefit.exporters.report.feet import BALL, HEEL, peaks, smoothed, upright
 from kinefit.exporters.tables import Table, quantity_table
 from kinefit.findings import runs_of
 
@@ -71,8 +71,7 @@ class Course:
     @cached_property
     def _places(self) -> NDArray:
         """(F, 4, 2, 3) [m] hips, heels and both balls of the left and the right side, floor at zero, y up."""
-        points = self.motion.positions(self.motion.body.landmarks.select(self.landmarks))
-        places = (points @ rotation_between_up(self.motion.up, "y").T).reshape(len(self.motion), 4, 2, 3)
+        places = upright(self.motion, self.landmarks).reshape(len(self.motion), 4, 2, 3)
         places[..., 1] -= np.percentile(places[:, 1:, :, 1].min(axis=(1, 2)), _FLOOR_PERCENTILE)
         return places
 

@@ -128,8 +128,7 @@ def feet_alone(motion: Motion) -> Feet | None:
     names = [f"{s}_{n}" for s in "lr" for n in ("hip", HEEL, *BALL, TOE)]
     if any(name not in motion.body.landmarks.names for name in names) or len(motion) < 3:
         return None
-    upright = motion.positions(motion.body.landmarks.select(tuple(names))) @ rotation_between_up(motion.up, "y").T
-    hips, heels, first, fifth, toes = np.moveaxis(upright.reshape(len(motion), 2, 5, 3), 2, 0)
+    hips, heels, first, fifth, toes = np.moveaxis(upright(motion, names).reshape(len(motion), 2, 5, 3), 2, 0)
     feet = np.stack([heels, 0.5 * (first + fifth), toes], axis=2)  # (F, side, heel, ball and toe, 3)
     across = hips[:, 1] - hips[:, 0]
     forward = np.cross([0.0, 1.0, 0.0], across)
@@ -146,6 +145,11 @@ def feet_alone(motion: Motion) -> Feet | None:
     ahead = (-ahead if backwards else ahead) * observed[:, None]  # of a leg that was not measured nothing is known
     left, right = (_events(motion, name, ahead[:, s], speed[:, s], least) for s, name in enumerate(("left", "right")))
     return Feet(left, right, belt, (bool(observed[0]), bool(observed[1])), backwards)
+
+
+def upright(motion: Motion, names: Sequence[str]) -> NDArray:
+    """(F, K, 3) [m] landmarks in a world turned to y up."""
+    return motion.positions(motion.body.landmarks.select(tuple(names))) @ rotation_between_up(motion.up, "y").T
 
 
 def foot_findings(motion: Motion) -> tuple[Finding, ...]:
