@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.bodies.motion import UP_AXES, Motion
 from kinefit.errors import ExportError, ObservationError, choices
+from kinefit.exporters.pictures.drawing import depth_colours
 from kinefit.fitting.tracking.recording import Recording
 from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.fitting.tracking.video import track
@@ -28,7 +29,7 @@ from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation.figures import draw_figure, in_front, places, write_video
 from kinefit.simulation.keypoints import simulate_keypoints, studio_rig
 from kinefit.simulation.movements import squat_and_wave
-from kinefit.simulation.rendering.scenes import COLOUR, STEREO, ColourSensor, SimulatedScene, depth_picture, picture
+from kinefit.simulation.rendering.scenes import COLOUR, STEREO, ColourSensor, SimulatedScene, picture
 from kinefit.simulation.rendering.scenes import room as room_around
 from kinefit.simulation.rendering.sensors import DEPTH_SENSORS, KINECT, DepthSensor, simulate_depth
 from kinefit.simulation.retarget import cut
@@ -258,7 +259,7 @@ def preview(scene: SimulatedScene, rig: Rig, *, frame: int | None = None, seed: 
         if camera.name in DEPTH_SENSORS:
             video = simulate_depth(scene.motion, camera, DEPTH_SENSORS[camera.name], seed=seed, scene=scene)
             z = points @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
-            image = depth_picture(video.frame(frame).depth, z.min() - 0.5, z.max() + 1.5)
+            image = depth_colours(video.frame(frame).depth, z.min() - 0.5, z.max() + 1.5)[..., ::-1]
         else:
             grey = camera.name != "colour"
             image = picture(scene, frame, camera, STEREO if grey else COLOUR, grey=grey, seed=seed)

@@ -201,6 +201,14 @@ def draw_dot(image: NDArray, uv: NDArray, radius: float, colour: tuple[int, int,
         cv2.circle(image, (x, y), r, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
+def depth_colours(depth: NDArray, near: float, far: float) -> NDArray[np.uint8]:
+    """Depth (H, W) [m] as colours (H, W, 3) RGB: red at `near` [m], blue at `far`, black for pixels without depth."""
+    share = np.clip((far - depth) / (far - near), 0.0, 1.0)
+    out = cv2.applyColorMap((255 * share).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
+    out[depth <= 0.0] = 0
+    return np.asarray(out, np.uint8)
+
+
 def hide_circles(image: NDArray[np.uint8], circles: NDArray) -> NDArray[np.uint8]:
     """A copy of a picture (H, W, 3) uint8 in which nothing can be made out within circles (N, 3) [px] u, v, radius."""
     out = np.array(image, order="C")

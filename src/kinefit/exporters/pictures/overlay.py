@@ -278,9 +278,7 @@ def depth_picture(
     if frame is not None:
         raster = render_body(motion.body, motion.state(frame), large)
         middle = float(np.median(raster.depth[raster.seen])) if raster.seen.any() else middle
-    shade = np.clip((middle + _COLOUR_RANGE_M - depth) / (2.0 * _COLOUR_RANGE_M), 0.0, 1.0)
-    picture = cv2.applyColorMap((255 * shade).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
-    picture = np.where((depth > 0)[..., None], picture, 0).astype(np.uint8)
+    picture = drawing.depth_colours(depth, middle - _COLOUR_RANGE_M, middle + _COLOUR_RANGE_M)
     out = np.ascontiguousarray(np.repeat(np.repeat(picture, times, axis=0), times, axis=1))
     if raster is not None and frame is not None:
         part, lost = raster.segment, np.append(motion.lost[frame], False)  # -1, the background, is not lost

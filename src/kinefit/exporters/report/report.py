@@ -34,6 +34,7 @@ from kinefit.exporters.tables import curves, spoken
 from kinefit.findings import listed, of_provenance
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
 
+_RANGE_HEADS = ("range of motion [°]", "left", "right", "middle", "left minus right")
 _BUDGET = 40  # pictures at 640 px: about 3 MB; more of them are made smaller
 
 SESSION = {
@@ -169,7 +170,7 @@ def _summary(
         "Summary", *([p.facts(facts)] if facts else []),
         p.callout(severity, "In short", *(p.paragraph(p.strong(f"{name}: "), text) for name, text in lines.items())),
         *(p.callout(*finding) for finding in findings),
-        *([angles.short_table(sure)] if sure else []),
+        *([p.table(_RANGE_HEADS, [one.row for one in sure])] if sure else []),
         *([f"Moved less than their error bars: {listed(least, 60)}."] if least else []), p.paragraph(about, small=True),
         p.folded("Lowest, highest, fastest of every angle", angles.ranges_table(motion), p.paragraph(more, small=True)),
         p.folded("Lengths of the body", lengths_table(motion)),
