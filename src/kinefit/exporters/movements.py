@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.motion import Motion, rotation_between_up
 from kinefit.errors import ObservationError
+from kinefit.exporters.gait.plates import GRAVITY
 from kinefit.exporters.report.feet import BALL, HEEL, peaks, smoothed, upright
 from kinefit.exporters.tables import Table, quantity_table
 from kinefit.findings import runs_of
@@ -140,7 +141,6 @@ _CLEAR_M = 0.03  # of the lower sole above the floor
 _FLIGHT_S = (0.15, 1.2)  # a run's flight is shorter
 _EVENT_STD_S = 0.01  # of take-off and landing, against plates
 _FALL_SHARE, _FALL_HZ = 0.7, 12.0  # of g; chosen on one drop jump (DJ1 of a person of 63 kg)
-_GRAVITY = 9.81
 
 
 def jumps(course: Course) -> list[Repetition]:
@@ -157,10 +157,10 @@ def jumps(course: Course) -> list[Repetition]:
         if not _FLIGHT_S[0] < flight < _FLIGHT_S[1]:
             continue
         rise = float(height[first:stop].max() - np.interp(start, motion.times, height))
-        speed = float(np.sqrt(2.0 * _GRAVITY * max(rise, 0.0)))
+        speed = float(np.sqrt(2.0 * GRAVITY * max(rise, 0.0)))
         values = {
             "flight time [s]": (flight, float(np.sqrt(2.0)) * std),
-            "height by flight [m]": (_GRAVITY * flight**2 / 8.0, _GRAVITY * flight / 4.0 * float(np.sqrt(2.0)) * std),
+            "height by flight [m]": (GRAVITY * flight**2 / 8.0, GRAVITY * flight / 4.0 * float(np.sqrt(2.0)) * std),
             "rise of the centre of mass [m]": (rise, float(np.hypot(speed * std, course.height_std[first]))),
         }
         out.append(Repetition("jump", start, end, values))
@@ -169,7 +169,7 @@ def jumps(course: Course) -> list[Repetition]:
 
 def _fall_ends(acceleration: NDArray, times: NDArray, top: int, way: int) -> float:
     """[s] where an acceleration (F,) [m/s²] upwards first is above that of a fall, before (-1) or after (1) a frame."""
-    limit = -_FALL_SHARE * _GRAVITY
+    limit = -_FALL_SHARE * GRAVITY
     course, clock = (values[top::way] for values in (acceleration, times))
     over = np.flatnonzero(course > limit)
     k = max(int(over[0]), 1) if len(over) else len(course) - 1

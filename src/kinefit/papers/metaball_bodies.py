@@ -27,8 +27,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.observations import PointCloud
 from kinefit.papers import _metaball_steps as steps
 from kinefit.papers._metaball_steps import AS_PRINTED, MetaballBody, MetaballHelps, OtherRows
-from kinefit.sensors.scene import Scene
-from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors import Scene, TrackSettings
 from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
 from kinefit.solving.least_squares import Fit, levenberg_marquardt
 

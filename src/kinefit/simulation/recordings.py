@@ -20,9 +20,7 @@ from kinefit._arguments import checked
 from kinefit.bodies.motion import UP_AXES, Motion
 from kinefit.errors import ExportError, ObservationError, choices
 from kinefit.exporters.pictures.drawing import depth_colours
-from kinefit.fitting.tracking.recording import Recording
-from kinefit.fitting.tracking.tracker import Tracker
-from kinefit.fitting.tracking.video import track
+from kinefit.fitting import Recording, Tracker, track
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import DepthFrame, Keypoints
 from kinefit.readers.calibration.read import write_calibration

@@ -16,10 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.morphs import operators as kinds
-from kinefit.bodies.surfaces.mesh import BodyMesh, MeshSurface, triangles
+from kinefit.bodies.surfaces import BodyMesh, MeshSurface, SkinnedMesh, triangles
 from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
-from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
 from kinefit.bodies.tree import BodyState
 from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, PointSet
+from kinefit.bodies import Body, Morphing, PointSet
 from kinefit.bodies.limbs import finger_groups
-from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.motion import OUTLIER_WEIGHT, Motion, Residuals
 from kinefit.bodies.rendering import Canvas, looks
 from kinefit.bodies.surfaces.mesh import MeshSurface

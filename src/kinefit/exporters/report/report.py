@@ -34,7 +34,6 @@ from kinefit.exporters.tables import curves, spoken
 from kinefit.findings import listed, of_provenance
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
 
-_RANGE_HEADS = ("range of motion [°]", "left", "right", "middle", "left minus right")
 _BUDGET = 40  # pictures at 640 px: about 3 MB; more of them are made smaller
 
 SESSION = {
@@ -155,6 +154,7 @@ def _summary(
         "What to do": _what_to_do(motion, moments),
     }  # fmt: skip
     least = [one.name for one in found if not one.is_sure]
+    heads = ("range of motion [°]", "left", "right", "middle", "left minus right")
     shared = motion.lasting is not None
     about = (
         "± is two standard deviations: nineteen of twenty such intervals hold the true value. Of a range it is that of "
@@ -170,7 +170,7 @@ def _summary(
         "Summary", *([p.facts(facts)] if facts else []),
         p.callout(severity, "In short", *(p.paragraph(p.strong(f"{name}: "), text) for name, text in lines.items())),
         *(p.callout(*finding) for finding in findings),
-        *([p.table(_RANGE_HEADS, [one.row for one in sure])] if sure else []),
+        *([p.table(heads, [one.row for one in sure])] if sure else []),
         *([f"Moved less than their error bars: {listed(least, 60)}."] if least else []), p.paragraph(about, small=True),
         p.folded("Lowest, highest, fastest of every angle", angles.ranges_table(motion), p.paragraph(more, small=True)),
         p.folded("Lengths of the body", lengths_table(motion)),
