@@ -387,7 +387,7 @@ class Motion:
         shift = turned_std(self.dof_std[:, :3], R, None if rays is None else rays[:, 0])
         turn = turned_std(self.dof_std[:, 3:6], R)
         dof_std = np.concatenate([shift, turn, self.dof_std[:, 6:]], axis=1)
-        return self._in_world(T_new_world, joint_std=turned_std(self.joint_std, R, rays), dof_std=dof_std)
+        return self._in_world(T_new_world, turned_std(self.joint_std, R, rays), dof_std)
 
     def turned(self, up: str) -> Motion:
         """The same motion in a world whose vertical axis is `up`."""
@@ -397,9 +397,9 @@ class Motion:
         T = se3.transform(R, np.zeros(3))
         axis = np.argmax(np.abs(R), axis=1)  # R takes axes onto axes; a product with it would make NaN of ∞ · 0
         dof_std = self.dof_std[:, np.concatenate([axis, 3 + axis, np.arange(6, self.dof_std.shape[1])])]
-        return replace(self._in_world(T, joint_std=self.joint_std[..., axis], dof_std=dof_std), up=up)
+        return replace(self._in_world(T, self.joint_std[..., axis], dof_std), up=up)
 
-    def _in_world(self, T_new_world: NDArray, **stds: NDArray) -> Motion:
+    def _in_world(self, T_new_world: NDArray, joint_std: NDArray, dof_std: NDArray) -> Motion:
         """The motion in another world (4, 4) [m], with the standard deviations there."""
         R = T_new_world[:3, :3]
         residuals = {
@@ -410,7 +410,7 @@ class Motion:
         return replace(
             self, Ts_world_root=T_new_world @ self.Ts_world_root, residuals=residuals,
             lasting=self.lasting and self.lasting.turned(R), plates=tuple(p.moved(T_new_world) for p in self.plates),
-            **stds,
+            joint_std=joint_std, dof_std=dof_std,
         )  # fmt: skip
 
 

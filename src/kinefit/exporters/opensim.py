@@ -98,7 +98,7 @@ def _three_axes(axes: Sequence[NDArray]) -> NDArray:
     if not axes:
         return _EYE
     if len(axes) == 2:
-        normal = np.cross(*axes)
+        normal = np.cross(axes[0], axes[1])
         return np.array([*axes, normal / max(float(np.linalg.norm(normal)), 1e-12)])
     return np.array(axes if len(axes) == 3 else [*axes, *perpendiculars(axes[0])])
 
