@@ -45,7 +45,7 @@ def jit(function: Callable[..., Any]) -> Callable[..., Any]:
             if Path(kept.cache_path).is_relative_to(folder):  # numba goes elsewhere if it has to
                 kernel._cache = kept
         except (OSError, RuntimeError) as error:
-            _warn_once(f"compiled kernels cannot be kept in {folder} ({error})")
+            _tell(f"compiled kernels cannot be kept in {folder} ({error})")
         finally:
             numba.config.CACHE_DIR = before
     return kernel
@@ -76,9 +76,9 @@ def kernel_folder() -> Path | None:
             problems.append(str(error))
             continue
         if problems:
-            _warn_once(f"compiled kernels are kept in {folder}, as the cache cannot be used: {problems[0]}")
+            _tell(f"compiled kernels are kept in {folder}, as the cache cannot be used: {problems[0]}")
         return folder
-    _warn_once(f"kernels are compiled at every start, as the cache cannot be used: {problems[0]}")
+    _tell(f"kernels are compiled at every start, as the cache cannot be used: {problems[0]}")
     return None
 
 
@@ -137,15 +137,15 @@ def _of_one(group: int) -> bool:
 
 
 @cache
-def _printed_notes() -> list[str]:
+def _told() -> list[str]:
     """Notes that were printed, one list for the process."""
     return []
 
 
-def _warn_once(problem: str) -> None:
+def _tell(problem: str) -> None:
     """Warn once for a process, whatever else goes wrong with the cache."""
-    if not _printed_notes():
-        _printed_notes().append(problem)
+    if not _told():
+        _told().append(problem)
         warnings.warn(f"{problem}. KINEFIT_CACHE names another folder.", RuntimeWarning, stacklevel=2)
 
 
@@ -186,11 +186,11 @@ class _Cache(caching.FunctionCache):
         try:
             return super().load_overload(sig, target_context)
         except Exception as error:
-            _warn_once(f"a compiled kernel in {self._cache_path} cannot be loaded ({error})")
+            _tell(f"a compiled kernel in {self._cache_path} cannot be loaded ({error})")
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:
             super().save_overload(sig, data)
         except OSError as error:
-            _warn_once(f"compiled kernels cannot be kept in {self._cache_path} ({error})")
+            _tell(f"compiled kernels cannot be kept in {self._cache_path} ({error})")
