@@ -44,7 +44,7 @@ def checked(function: F) -> F:
                 problem = f"{function.__name__}: {name} is a {type(value).__name__}"
                 if isinstance(value, Sequence | Mapping) and not isinstance(value, str):
                     problem += " of the wrong content or type"
-                raise ObservationError(problem, remedy=f"Give {_told(_hints(function)[name])}.")
+                raise ObservationError(problem, remedy=f"Give {_hint_text(_hints(function)[name])}.")
         return function(*args, **more)
 
     return typing.cast(F, call)
@@ -174,15 +174,15 @@ def _is_array(value: Any) -> bool:
         return False
 
 
-def _told(hint: Any) -> str:
+def _hint_text(hint: Any) -> str:
     """An annotation in short."""
     if hint == ArrayLike or typing.get_origin(hint) is np.ndarray:
         return "an array of numbers"
     of = typing.get_args(hint)
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return " or ".join(dict.fromkeys(_told(one) for one in of))
+        return " or ".join(dict.fromkeys(_hint_text(one) for one in of))
     if hint is type(None):
         return "None"
     name = getattr(typing.get_origin(hint) or hint, "__name__", str(hint))
-    inside = ", ".join(_told(one) for one in of if one is not Ellipsis)
+    inside = ", ".join(_hint_text(one) for one in of if one is not Ellipsis)
     return f"{name} of {inside}" if inside and name not in ("Callable", "PathLike") else name

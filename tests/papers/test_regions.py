@@ -145,10 +145,14 @@ def test_what_cannot_be_is_refused():
         pose_from_regions(BODY, state(BODY, 0), RIG, {"front": images(0)["front"][::2]})
 
 
-def test_smoothing_is_scipys_with_zeros_beyond_the_edges():
-    from scipy.ndimage import gaussian_filter
-
-    grid = np.random.default_rng(0).random((5, 12, 9))
-    for sigma in (0.7, 1.0, 2.0):
-        expected = gaussian_filter(grid, sigma, mode="constant")
-        np.testing.assert_allclose(densities._smoothed(grid, sigma), expected, atol=1e-12)
+def test_a_parzen_density_is_a_gaussian_about_each_pixel_cut_at_the_edges():
+    shape, width = densities._GRID_SHAPE, densities._CELL_WIDTH
+    count = np.zeros(shape)
+    count[1, 30, 40] = 5.0
+    steps = np.arange(-4, 5) * width
+    bell = np.exp(-0.5 * np.square(steps / densities._PARZEN_SIGMA))
+    bell /= bell.sum()
+    expected = np.zeros((shape[0] + 8, *shape[1:]))
+    expected[1:10, 26:35, 36:45] = bell[:, None, None] * bell[:, None] * bell / width**3
+    found = np.exp(densities.parzen_density(count.ravel())).reshape(shape)
+    np.testing.assert_allclose(found, expected[4:-4] + densities._MIN_DENSITY, rtol=1e-9)

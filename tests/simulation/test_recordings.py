@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ExportError, ObservationError
+from kinefit.exporters.pictures.drawing import depth_colours
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.readers.videos.video import Video
 from kinefit.simulation import SENSORS, TOF, cut, simulate_depth, squat_and_wave, write_recording
-from kinefit.simulation.rendering.scenes import depth_picture
 
 
 @pytest.fixture(scope="module")
@@ -89,11 +89,11 @@ def test_a_sensor_that_does_not_exist_is_refused(motion, tmp_path, sensors):
 
 
 def test_depths_as_colours():
-    shown = depth_picture(np.array([[0.0, 1.0, 5.0]]), 1.0, 5.0)
+    shown = depth_colours(np.array([[0.0, 1.0, 5.0]]), 1.0, 5.0)
     assert shown.shape == (1, 3, 3)
     assert not shown[0, 0].any()
-    assert shown[0, 1, 2] > shown[0, 1, 0]  # near is red
-    assert shown[0, 2, 0] > shown[0, 2, 2]
+    assert shown[0, 1, 0] > shown[0, 1, 2]  # near is red
+    assert shown[0, 2, 2] > shown[0, 2, 0]
 
 
 def test_all_sensors_are_named():

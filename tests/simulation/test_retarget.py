@@ -7,7 +7,7 @@ import pytest
 from tests.readers.skeletons.bvh_variants import along, any_frames, turned, write_variant
 
 from kinefit.bodies import load_body
-from kinefit.bodies.motion import rotation_between_up
+from kinefit.bodies.motion import Residuals, rotation_between_up
 from kinefit.bodies.toml.joint_names import recorded_joints
 from kinefit.errors import BodyError, ObservationError
 from kinefit.findings import of_provenance
@@ -148,6 +148,19 @@ def test_unknown_skeletons_and_bodies_are_told():
     Ts[3, names.index("lfoot"), :3, 3] = Ts[3, names.index("knie"), :3, 3]
     with pytest.raises(ObservationError, match="'shank_l' has no length"):
         retarget(replace(skeleton, Ts_world_joint=Ts))
+
+
+def test_cut_keeps_the_residuals_of_its_frames():
+    motion = squat_and_wave()
+    per_segment, segments = np.arange(len(motion) * 2.0).reshape(-1, 2), np.array([0, 1])
+    residuals = Residuals(
+        ("pelvis", "abdomen"), segments, per_segment[..., None], per_segment, "m", per_segment[..., None],
+        np.zeros(len(motion), bool), rms=per_segment, count=per_segment,
+    )
+    kept = cut(replace(motion, residuals={"depth": residuals}), 3, 5).residuals["depth"]
+    assert len(kept.norms) == 2 and not kept.of_points
+    np.testing.assert_array_equal(kept.rms, per_segment[3:5])
+    np.testing.assert_array_equal(kept.count, per_segment[3:5])
 
 
 def test_cut_and_resampled():

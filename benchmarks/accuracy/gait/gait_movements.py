@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.accuracy.gait.gait_events import fitted
 from benchmarks.figures import amount, data, figure
-from kinefit.exporters.movements.found import find_movements
+from kinefit.exporters.movements import find_movements
 
 _JUMPS = ("subject4/DJ1", "subject4/DJ2", "opencap/DJ1")
 _COUNTED = {"subject4/squats1": "squat", "subject4/STSweakLegs1": "sit to stand"}

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from benchmarks.figures import ROOT, amount, figure
 from benchmarks.scenes.curves import COLOURS, curves
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.morphs.morphing import JointMotion, LocalMorph, Morphing
+from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.bodies.morphs.operators import JointMotion, LocalMorph
 from kinefit.bodies.rendering import Canvas
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera

@@ -126,7 +126,7 @@ def nearest_frame(times: NDArray, time: float, rate: float) -> int | None:
     return frame if abs(times[frame] - time) < 1.0 / rate else None
 
 
-def _turned_std(std: NDArray, R: NDArray, rays: NDArray | None = None) -> NDArray:
+def turned_std(std: NDArray, R: NDArray, rays: NDArray | None = None) -> NDArray:
     """(..., 3) standard deviations along new axes; of errors along rays (..., 3) in the old ones, or along its axes."""
     var = np.square(std)
     finite = np.isfinite(var)
@@ -383,20 +383,11 @@ class Motion:
         eye : (3,) [m] in the old world, of a camera that is the only sensor: errors are taken to lie along its rays.
             Default: along the old axes.
         """
-        R, roots, old = T_new_world[:3, :3], T_new_world @ self.Ts_world_root, self.joint_centres
-        rays = None if eye is None else old - eye
-        residuals = {
-            name: replace(r, values=r.values @ R.T, measured=r.measured @ R.T + T_new_world[:3, 3])
-            if r.unit == "m" and r.values.shape[-1] == 3 else r
-            for name, r in self.residuals.items()
-        }  # fmt: skip
-        shift = _turned_std(self.dof_std[:, :3], R, None if rays is None else rays[:, 0])
-        turn = _turned_std(self.dof_std[:, 3:6], R)
-        return replace(
-            self, Ts_world_root=roots, joint_std=_turned_std(self.joint_std, R, rays), residuals=residuals,
-            dof_std=np.concatenate([shift, turn, self.dof_std[:, 6:]], axis=1),
-            lasting=self.lasting and self.lasting.turned(R), plates=tuple(p.moved(T_new_world) for p in self.plates),
-        )  # fmt: skip
+        R, rays = T_new_world[:3, :3], None if eye is None else self.joint_centres - eye
+        shift = turned_std(self.dof_std[:, :3], R, None if rays is None else rays[:, 0])
+        turn = turned_std(self.dof_std[:, 3:6], R)
+        dof_std = np.concatenate([shift, turn, self.dof_std[:, 6:]], axis=1)
+        return self._in_world(T_new_world, turned_std(self.joint_std, R, rays), dof_std)
 
     def turned(self, up: str) -> Motion:
         """The same motion in a world whose vertical axis is `up`."""
@@ -405,20 +396,22 @@ class Motion:
         R = rotation_between_up(self.up, up)
         T = se3.transform(R, np.zeros(3))
         axis = np.argmax(np.abs(R), axis=1)  # R takes axes onto axes; a product with it would make NaN of ∞ · 0
+        dof_std = self.dof_std[:, np.concatenate([axis, 3 + axis, np.arange(6, self.dof_std.shape[1])])]
+        return replace(self._in_world(T, self.joint_std[..., axis], dof_std), up=up)
+
+    def _in_world(self, T_new_world: NDArray, joint_std: NDArray, dof_std: NDArray) -> Motion:
+        """The motion in another world (4, 4) [m], with the standard deviations there."""
+        R = T_new_world[:3, :3]
         residuals = {
-            name: replace(r, values=r.values @ R.T, measured=r.measured @ R.T) if r.unit == "m" and r.of_points else r
+            name: replace(r, values=r.values @ R.T, measured=se3.apply(T_new_world, r.measured))
+            if r.unit == "m" and r.of_points else r
             for name, r in self.residuals.items()
-        }
+        }  # fmt: skip
         return replace(
-            self,
-            Ts_world_root=T @ self.Ts_world_root,
-            dof_std=self.dof_std[:, np.concatenate([axis, 3 + axis, np.arange(6, self.dof_std.shape[1])])],
-            joint_std=self.joint_std[..., axis],
-            residuals=residuals,
-            up=up,
-            lasting=self.lasting and self.lasting.turned(R),
-            plates=tuple(plate.moved(T) for plate in self.plates),
-        )
+            self, Ts_world_root=T_new_world @ self.Ts_world_root, residuals=residuals,
+            lasting=self.lasting and self.lasting.turned(R), plates=tuple(p.moved(T_new_world) for p in self.plates),
+            joint_std=joint_std, dof_std=dof_std,
+        )  # fmt: skip
 
 
 Columns = dict[str, NDArray]

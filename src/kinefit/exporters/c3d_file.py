@@ -79,13 +79,12 @@ def c3d_bytes(
     return head.ljust(_BLOCK, b"\0") + _padded(_parameters(whole, blocks)) + (_padded(data) if counted else data)
 
 
-def label_groups(labels: Sequence[str], about: Sequence[str]) -> dict[str, Value]:
-    """LABELS, LABELS2 ... and DESCRIPTIONS: no list holds more than 255."""
-    out: dict[str, Value] = {}
+def label_groups(labels: Sequence[str], about: Sequence[str], **others: Value) -> dict[str, Value]:
+    """Lists of one length: LABELS, DESCRIPTIONS and others. None holds more than 255: LABELS2, LABELS3 ... go on."""
+    lists, out = {"LABELS": labels, "DESCRIPTIONS": about, **others}, dict[str, Value]()
     for k in range(0, len(labels), _MAX_DIMENSION):
         suffix = str(k // _MAX_DIMENSION + 1) if k else ""
-        out[f"LABELS{suffix}"] = labels[k : k + _MAX_DIMENSION]
-        out[f"DESCRIPTIONS{suffix}"] = about[k : k + _MAX_DIMENSION]
+        out |= {name + suffix: values[k : k + _MAX_DIMENSION] for name, values in lists.items()}
     return out
 
 
@@ -338,19 +337,16 @@ def _residual_unit(residual: NDArray) -> float:
 
 
 def _events(events: Sequence[MarkerEvent]) -> dict[str, Value]:
-    """The group EVENT: no list holds more than 255, the next ones go on with LABELS2, TIMES2 ..."""
-    out: dict[str, Value] = {"USED": np.array(len(events), np.uint16)}
-    for k in range(0, len(events), _MAX_DIMENSION):
-        part, suffix = events[k : k + _MAX_DIMENSION], str(k // _MAX_DIMENSION + 1) if k else ""
-        lists: dict[str, Value] = {
-            "CONTEXTS": [e.context for e in part], "LABELS": [e.label for e in part],
-            "SUBJECTS": [e.subject for e in part], "DESCRIPTIONS": [e.description for e in part],
-            "TIMES": np.array([[e.time // 60.0, e.time % 60.0] for e in part], np.float32).T,
-            "ICON_IDS": np.array([e.icon for e in part], np.uint16),
-            "GENERIC_FLAGS": np.array([e.flag for e in part], np.uint8),
-        }  # fmt: skip
-        out |= {name + suffix: values for name, values in lists.items()}
-    return out
+    """The group EVENT."""
+    lists = label_groups(
+        [e.label for e in events], [e.description for e in events], CONTEXTS=[e.context for e in events],
+        SUBJECTS=[e.subject for e in events],
+        TIMES=np.array([[e.time // 60.0, e.time % 60.0] for e in events], np.float32),
+        ICON_IDS=np.array([e.icon for e in events], np.uint16),
+        GENERIC_FLAGS=np.array([e.flag for e in events], np.uint8),
+    )  # fmt: skip
+    lists = {name: values.T if isinstance(values, np.ndarray) else values for name, values in lists.items()}
+    return {"USED": np.array(len(events), np.uint16), **lists}
 
 
 def _trc(markers: Markers, path: Path, unit: str, factor: float) -> str:

@@ -128,8 +128,8 @@ def pose(
     T = Ts_world_segment
     places = np.concatenate([T[:, :3, 3], se3.quaternion(T[:, :3, :3])], axis=1)
     return {
-        "segments": _rounded(places), "joint_std": _told(joint_std), "angles": _rounded(angles),
-        "root_std": _told(dof_std[:6]), "angle_std": _told(dof_std[6:]), "quality": round(float(quality), 3),
+        "segments": _rounded(places), "joint_std": _finite(joint_std), "angles": _rounded(angles),
+        "root_std": _finite(dof_std[:6]), "angle_std": _finite(dof_std[6:]), "quality": round(float(quality), 3),
         "segment_quality": np.round(segment_quality, 3).tolist(), "lost": np.flatnonzero(lost).tolist(),
     }  # fmt: skip
 
@@ -166,7 +166,7 @@ def _rounded(values: NDArray) -> Any:
     return np.round(values, _DIGITS).tolist()
 
 
-def _told(std: NDArray) -> Any:
+def _finite(std: NDArray) -> Any:
     """Standard deviations as JSON has them."""
     finite = np.isfinite(std)
     if finite.all():

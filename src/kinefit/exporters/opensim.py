@@ -24,6 +24,7 @@ from kinefit.bodies.motion import Motion
 from kinefit.bodies.surfaces import Surface
 from kinefit.errors import ExportError
 from kinefit.exporters.skeletons.common import UNITS, check_up, euler, euler_zxy, length_factor, numbers, plain_names
+from kinefit.geometry.lines import perpendiculars
 
 _DENSITY_KG_M3, _MIN_MASS_KG = 1000.0, 0.01  # [kg/m³], [kg]
 _EYE, _ZERO = np.eye(3), "0 0 0"
@@ -94,16 +95,12 @@ def _joint(
 
 def _three_axes(axes: Sequence[NDArray]) -> NDArray:
     """(3, 3) the axes, made up to three by directions at right angles to them."""
-    out = [np.asarray(axis, float) for axis in axes]
-    while len(out) < 3:
-        if len(out) == 2:
-            normal = np.cross(out[0], out[1])
-            out.append(normal / max(float(np.linalg.norm(normal)), 1e-12))
-        else:
-            rest = _EYE[np.argmin(np.abs(out[0]))] if out else _EYE[0]
-            out.append(rest - (rest @ out[0]) * out[0] if out else rest)
-            out[-1] /= np.linalg.norm(out[-1])
-    return np.array(out)
+    if not axes:
+        return _EYE
+    if len(axes) == 2:
+        normal = np.cross(axes[0], axes[1])
+        return np.array([*axes, normal / max(float(np.linalg.norm(normal)), 1e-12)])
+    return np.array(axes if len(axes) == 3 else [*axes, *perpendiculars(axes[0])])
 
 
 def _transform_axis(transform: ET.Element, name: str, axis: NDArray, coordinate: str | None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter
 
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
@@ -36,19 +37,8 @@ def colour_cells(image: ArrayLike, camera: Camera) -> NDArray:
 
 def parzen_density(count: NDArray) -> NDArray:
     """Logarithm (N,) of the Parzen density estimate from pixel counts (N,) in the cells of CIELab."""
-    density = _smoothed(count.reshape(_GRID_SHAPE), _PARZEN_SIGMA / _CELL_WIDTH).ravel()
+    density = gaussian_filter(count.reshape(_GRID_SHAPE), _PARZEN_SIGMA / _CELL_WIDTH, mode="constant").ravel()
     return np.asarray(np.log(density / max(count.sum(), 1.0) / _CELL_WIDTH**3 + _MIN_DENSITY))
-
-
-def _smoothed(grid: NDArray, sigma: float) -> NDArray:
-    """Convolve a grid, zero outside, with a Gaussian of a standard deviation in cells."""
-    reach = round(4.0 * sigma)
-    kernel = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / sigma))
-    for axis in range(grid.ndim):
-        wide = np.moveaxis(np.pad(grid, [(reach, reach) if k == axis else (0, 0) for k in range(grid.ndim)]), axis, 0)
-        parts = (share * wide[k : k + grid.shape[axis]] for k, share in enumerate(kernel / kernel.sum()))
-        grid = np.moveaxis(np.sum(list(parts), axis=0), 0, axis)
-    return grid
 
 
 def mixture_density(count: NDArray) -> NDArray:

@@ -13,8 +13,7 @@ from kinefit.bodies.surfaces import Metaballs
 from kinefit.bodies.surfaces.places import nearest
 from kinefit.errors import ObservationError
 from kinefit.geometry.losses import SQUARED, Loss
-from kinefit.solving.correspondences import field_rows
-from kinefit.solving.correspondences.points import prior_rows
+from kinefit.solving.correspondences import field_rows, prior_rows
 from kinefit.solving.least_squares import Fit
 from kinefit.solving.rows import AnyRows
 

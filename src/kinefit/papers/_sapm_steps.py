@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.geometry.se3 import nearest_rotation
+from kinefit.geometry import se3
 
 MIN_COARSE_POINTS = 6
 """Points of a segment that is matched by the coarse update (P5: "our threshold is 6")."""
@@ -71,20 +71,13 @@ def candidate_table(
     return CandidateTable(order, columns)
 
 
-def motion(x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
-    """Rigid motion of points x (N, 3) onto y (N, 3) [m] by SVD, (1) (Arun et al.): R (3, 3), t (3,) [m]."""
-    a, b = x.mean(0), y.mean(0)
-    R = nearest_rotation((y - b).T @ (x - a))
-    return R, b - R @ a
+def errors(x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
+    """Errors (N,) [m] of points x (N, 3) against y (N, 3) under the best motion T (4, 4) by SVD, (1) (Arun et al.)."""
+    T = se3.aligned(x, y)
+    return np.linalg.norm(y - se3.apply(T, x), axis=1), T
 
 
-def errors(x: NDArray, y: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Errors (N,) [m] of points x (N, 3) against y (N, 3) under the best motion; R, t."""
-    R, t = motion(x, y)
-    return np.linalg.norm(y - x @ R.T - t, axis=1), R, t
-
-
-def coarse_updates(table: CandidateTable, x: NDArray, at: NDArray, limit: float) -> Iterator[tuple[NDArray, NDArray]]:
+def coarse_updates(table: CandidateTable, x: NDArray, at: NDArray, limit: float) -> Iterator[NDArray]:
     """First update rule: start with all first candidates, and replace the worst match by its next. Yields motions.
 
     Parameters
@@ -98,15 +91,15 @@ def coarse_updates(table: CandidateTable, x: NDArray, at: NDArray, limit: float)
         if len(rows) < 3:
             return
         chosen = np.array([table.columns[j][heads[j]] for j in rows])
-        e, R, t = errors(x[table.order[rows]], at[chosen])
+        e, T = errors(x[table.order[rows]], at[chosen])
         if e.mean() < limit:
-            yield R, t
+            yield T
         moved = [k for k, j in enumerate(rows) if j > 0]
         heads[rows[max(moved, key=lambda k: e[k])]] += 1
 
 
-def triples(table: CandidateTable, x: NDArray, at: NDArray, limit: float) -> Iterator[tuple[NDArray, NDArray]]:
-    """Second update rule: the pivot with its nearest and its farthest neighbours, then the next. Yields motions (R, t).
+def triples(table: CandidateTable, x: NDArray, at: NDArray, limit: float) -> Iterator[NDArray]:
+    """Second update rule: the pivot with its nearest and its farthest neighbours, then the next. Yields motions (4, 4).
 
     For a point pair, or if only one neighbour has candidates, each of these with the pivot: the rotation about the pair
     is undetermined, and the children's matches confirm the motion (P5 3.2). at (N + 1, 3) [m], limit [m]: see
@@ -115,21 +108,21 @@ def triples(table: CandidateTable, x: NDArray, at: NDArray, limit: float) -> Ite
     filled = [j for j in range(1, len(table.columns)) if len(table.columns[j])]
     if len(filled) == 1:
         for other in table.columns[filled[0]]:
-            e, R, t = errors(x[table.order[[0, filled[0]]]], at[[table.columns[0][0], other]])
+            e, T = errors(x[table.order[[0, filled[0]]]], at[[table.columns[0][0], other]])
             if e.mean() < limit:
-                yield R, t
+                yield T
     pairs = [(i, j) for i in filled for j in reversed(filled) if i < j]
     for i, j in pairs:
         for near, far in product(table.columns[i], table.columns[j]):
             if near != far:
-                e, R, t = errors(x[table.order[[0, i, j]]], at[[table.columns[0][0], near, far]])
+                e, T = errors(x[table.order[[0, i, j]]], at[[table.columns[0][0], near, far]])
                 if e.mean() < limit:
-                    yield R, t
+                    yield T
 
 
-def nearest(x: NDArray, R: NDArray, t: NDArray, points: NDArray, free: NDArray, limit: float) -> NDArray:
+def nearest(x: NDArray, T: NDArray, points: NDArray, free: NDArray, limit: float) -> NDArray:
     """Closest free point (k,) of each moved model point within 2 l ε = `limit` [m], (5); -1 for none."""
-    d = np.linalg.norm((x @ R.T + t)[:, None] - points, axis=-1)
+    d = np.linalg.norm(se3.apply(T, x)[:, None] - points, axis=-1)
     d[:, ~free] = np.inf
     found = d.argmin(1)
     own = d[np.arange(len(x)), found]

@@ -13,9 +13,8 @@ from collections.abc import Mapping, Sequence
 from kinefit._arguments import renamed
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.motion import Motion
+from kinefit.fitting import Recording, track
 from kinefit.fitting.subject.subject import Progress
-from kinefit.fitting.tracking.recording import Recording
-from kinefit.fitting.tracking.video import track
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Frame
 from kinefit.sensors.settings import TrackSettings

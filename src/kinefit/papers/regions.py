@@ -26,11 +26,10 @@ from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.errors import ObservationError, check_choice
 from kinefit.geometry.camera import Rig
 from kinefit.papers._colour_densities import COLOURS, DENSITIES, colour_cells
+from kinefit.solving import Rows, gauss_newton
 from kinefit.solving.correspondences import point_rows
 from kinefit.solving.correspondences.closures import closure_targets
 from kinefit.solving.correspondences.contours.outlines import RimFinder, outline_rows
-from kinefit.solving.least_squares import gauss_newton
-from kinefit.solving.rows import Rows
 
 __all__ = ["RegionFit", "pose_from_regions", "track_regions"]
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import shaped
+from kinefit.geometry import se3
 from kinefit.markers.model.model import MarkerModel
 from kinefit.papers import _sapm_steps as steps
 from kinefit.papers._sapm_steps import candidate_table, coarse_updates, errors, mean_distance, nearest, triples
@@ -115,12 +116,12 @@ def segment_matches(subject: SapmProblem, s: int, parent: int, found: NDArray) -
         tables = [t for t in tables if t.filled > subject.beta * len(model)]
         for table in sorted(tables, key=lambda t: -t.size):
             update = coarse_updates if count >= steps.MIN_COARSE_POINTS else triples
-            for R, t in update(table, model, at, epsilon * length):
-                match = nearest(x, R, t, points, free, 2 * length * epsilon)
+            for T in update(table, model, at, epsilon * length):
+                match = nearest(x, T, points, free, 2 * length * epsilon)
                 here = match >= 0
                 if here.sum() < max(min(3, count), 2) or here.sum() <= subject.beta * count or tuple(match) in seen:
                     continue
-                e, _, _ = errors(x[here], points[match[here]])
+                e, _ = errors(x[here], points[match[here]])
                 if e.mean() < epsilon * length and (known < 0).any() | (match == known).any():
                     seen.add(tuple(match))
                     yield match
@@ -140,8 +141,8 @@ def pivots(subject: SapmProblem, s: int, parent: int, found: NDArray, free: NDAr
     if (match >= 0).sum() >= 3:  # a virtual joint
         joint = next(j for j in subject.model.joints if {j.parent, j.child} == {s, parent})
         there, here = (joint.in_parent, joint.in_child) if joint.parent == parent else (joint.in_child, joint.in_parent)
-        _, R, t = errors(above[match >= 0], points[match[match >= 0]])
-        at[-1] = R @ there + t
+        _, T = errors(above[match >= 0], points[match[match >= 0]])
+        at[-1] = se3.apply(T, there)
         model = np.vstack([x, here])
         yield [candidate_table(model, points, free, len(x), at[-1], -1, epsilon)], model, at
         return

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit.bodies import Body, MeshSurface
-from kinefit.bodies.motion import UP_AXES, Motion
+from kinefit.bodies.motion import UP_AXES, Motion, turned_std
 from kinefit.bodies.rendering.looks import side_colour
 from kinefit.bodies.surfaces import Surface
 from kinefit.errors import BodyError, ExportError, ObservationError
@@ -245,7 +245,7 @@ def replayed(
     carried = np.tile(np.eye(4), (len(motion), 1, 1))
     carried[:, :3, 3] = (speed * t + 0.5 * gain * t**2)[:, None] * down
     return replace(
-        motion, Ts_world_root=carried @ T @ motion.Ts_world_root, joint_std=_turned(motion.joint_std, T[:3, :3]),
+        motion, Ts_world_root=carried @ T @ motion.Ts_world_root, joint_std=turned_std(motion.joint_std, T[:3, :3]),
         residuals={}, plates=(), name=f"{motion.name} replayed",
         provenance={**motion.provenance, "replay": {"slope": slope, "heading": heading, "speed": speed, "gain": gain}},
     )  # fmt: skip
@@ -266,12 +266,6 @@ def _inclined(motion: Motion, slope: float, heading: float) -> tuple[NDArray, ND
     level = se3.exp_so3(np.radians(heading) * up) @ np.roll(up, 1)
     R = se3.exp_so3(np.radians(slope) * np.cross(level, -up))
     return up, R @ level, R
-
-
-def _turned(std: NDArray, R: NDArray) -> NDArray:
-    """(F, S, 3) standard deviations along rotated axes, for independent errors along the old ones."""
-    known = np.isfinite(std).all(axis=-1, keepdims=True)
-    return np.where(known, np.sqrt(np.square(np.where(known, std, 0.0)) @ np.square(R).T), np.inf)
 
 
 def film(

@@ -8,6 +8,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,16 +19,15 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.bodies.motion import UP_AXES, Motion
 from kinefit.errors import ExportError, ObservationError, choices
-from kinefit.fitting.tracking.recording import Recording
-from kinefit.fitting.tracking.tracker import Tracker
-from kinefit.fitting.tracking.video import track
+from kinefit.exporters.pictures.drawing import depth_colours
+from kinefit.fitting import Recording, Tracker, track
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import DepthFrame, Keypoints
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation.figures import draw_figure, in_front, places, write_video
 from kinefit.simulation.keypoints import simulate_keypoints, studio_rig
 from kinefit.simulation.movements import squat_and_wave
-from kinefit.simulation.rendering.scenes import COLOUR, STEREO, ColourSensor, SimulatedScene, depth_picture, picture
+from kinefit.simulation.rendering.scenes import COLOUR, STEREO, ColourSensor, SimulatedScene, picture
 from kinefit.simulation.rendering.scenes import room as room_around
 from kinefit.simulation.rendering.sensors import DEPTH_SENSORS, KINECT, DepthSensor, simulate_depth
 from kinefit.simulation.retarget import cut
@@ -126,24 +126,34 @@ def write_recording(
         farthest = max(cameras, key=lambda camera: float(np.linalg.norm(camera.centre_world - middle)))
         scene = SimulatedScene(motion, scene.mesh, room_around(motion, farthest))
     job = _Job(scene, Rig(tuple(cameras)), seed, step or (lambda what, done, total: None))
+    remedy = "Give a folder that can be written, on a disk with free space."
+    with _staged(folder, "the recording cannot be written", remedy) as staging:
+        entries = [entry for sensor in chosen for entry in _write_sensor(job, sensor, chosen, staging)]
+        write_calibration(job.rig, staging / "calibration.toml")
+        _save(staging / "preview.png", preview(job.scene, job.rig, seed=seed))
+        text = _take_text(_TITLE, motion, entries, str(body or motion.body.name))
+        (staging / "take.toml").write_text(text, encoding="utf-8")
+        if beside is not None:
+            beside(staging)
+    return folder / "take.toml"
+
+
+@contextmanager
+def _staged(folder: Path, problem: str, remedy: str) -> Iterator[Path]:
+    """Give a temporary folder, whose files move into `folder` when the block ends well.
+
+    Raises
+    ------
+    ExportError
+        The problem and its remedy, where the system refuses.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
-            staging = Path(name)
-            entries = [entry for sensor in chosen for entry in _write_sensor(job, sensor, chosen, staging)]
-            write_calibration(job.rig, staging / "calibration.toml")
-            _save(staging / "preview.png", preview(job.scene, job.rig, seed=seed))
-            text = _take_text(_TITLE, motion, entries, str(body or motion.body.name))
-            (staging / "take.toml").write_text(text, encoding="utf-8")
-            if beside is not None:
-                beside(staging)
-            _move(staging, folder)
+            yield Path(name)
+            _move(Path(name), folder)
     except OSError as error:  # PyAV's file errors are OSErrors too
-        raise ExportError(
-            f"the recording cannot be written ({error.strerror or error})", file=folder,
-            remedy="Give a folder that can be written, on a disk with free space.",
-        ) from error
-    return folder / "take.toml"
+        raise ExportError(f"{problem} ({error.strerror or error})", file=folder, remedy=remedy) from error
 
 
 def _cameras(
@@ -247,7 +257,7 @@ def preview(scene: SimulatedScene, rig: Rig, *, frame: int | None = None, seed: 
         if camera.name in DEPTH_SENSORS:
             video = simulate_depth(scene.motion, camera, DEPTH_SENSORS[camera.name], seed=seed, scene=scene)
             z = points @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
-            image = depth_picture(video.frame(frame).depth, z.min() - 0.5, z.max() + 1.5)
+            image = depth_colours(video.frame(frame).depth, z.min() - 0.5, z.max() + 1.5)[..., ::-1]
         else:
             grey = camera.name != "colour"
             image = picture(scene, frame, camera, STEREO if grey else COLOUR, grey=grey, seed=seed)
@@ -316,25 +326,16 @@ def write_synthetic_take(folder: str | os.PathLike[str], motion: Motion | None =
     goes_far = np.argmax(high - low) != "xyz".index(motion.up[-1])
     rig = studio_rig(motion, size=_IMAGE_SIZE[::-1] if goes_far else _IMAGE_SIZE)
     detections = simulate_keypoints(motion, rig, "MEDIAPIPE_33", noise_px=1.5, outliers=0.05, missing=0.05, seed=seed)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
-            staging = Path(name)
-            entries = [f'[[camera]]\nname = "{camera}"\nvideo = "{camera}.mp4"\n' for camera in rig.names]
-            for camera, keypoints in zip(rig, detections):
-                figures = (draw_figure(motion, frame, camera) for frame in range(len(motion)))
-                write_video(staging / f"{camera.name}.mp4", figures, motion.rate, camera.size)
-                entries.append(_write_landmarks(keypoints, staging))
-            write_calibration(rig, staging / "calibration.toml")
-            text = _take_text(_FOUR_CAMERAS, motion, entries, motion.body.name)
-            (staging / "take.toml").write_text(text, encoding="utf-8")
-            for path in sorted(staging.iterdir(), key=lambda path: path.name == "take.toml"):
-                path.replace(folder / path.name)
-    except OSError as error:  # PyAV's file errors are OSErrors too
-        raise ExportError(
-            f"the synthetic take cannot be written ({error.strerror or error})", file=folder,
-            remedy="Give a folder that can be written, on a disk with 10 MB free.",
-        ) from error
+    remedy = "Give a folder that can be written, on a disk with 10 MB free."
+    with _staged(folder, "the synthetic take cannot be written", remedy) as staging:
+        entries = [f'[[camera]]\nname = "{camera}"\nvideo = "{camera}.mp4"\n' for camera in rig.names]
+        for camera, keypoints in zip(rig, detections):
+            figures = (draw_figure(motion, frame, camera) for frame in range(len(motion)))
+            write_video(staging / f"{camera.name}.mp4", figures, motion.rate, camera.size)
+            entries.append(_write_landmarks(keypoints, staging))
+        write_calibration(rig, staging / "calibration.toml")
+        text = _take_text(_FOUR_CAMERAS, motion, entries, motion.body.name)
+        (staging / "take.toml").write_text(text, encoding="utf-8")
     return folder / "take.toml"
 
 

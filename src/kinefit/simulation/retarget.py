@@ -260,10 +260,9 @@ def cut(motion: Motion, start: int, stop: int | None = None) -> Motion:
             f"'{motion.name}' has no frames between {start} and {stop}",
             remedy=f"Give frames from 0 to {len(motion) - 1}.",
         )
+    frames = ("values", "weights", "measured", "swapped", "rms", "count")  # rms and count of surfaces alone
     residuals = {
-        name: replace(
-            r, values=r.values[rows], weights=r.weights[rows], measured=r.measured[rows], swapped=r.swapped[rows]
-        )
+        name: replace(r, **{key: column[rows] for key in frames if (column := getattr(r, key)) is not None})
         for name, r in motion.residuals.items()
     }
     times = motion.times[rows]

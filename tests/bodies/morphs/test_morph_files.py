@@ -8,8 +8,8 @@ from tests.docs.blocks import blocks
 
 from kinefit.bodies import BodyState, load_body, parse_body, save_body
 from kinefit.bodies.morphs.morph_files import format_morphs
-from kinefit.bodies.morphs.morphing import GlobalMorph, JointMotion, LocalMorph, Morphing, SegmentMorph
-from kinefit.bodies.morphs.operators import Steering
+from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, SegmentMorph, Steering
 from kinefit.bodies.parts import without_part
 from kinefit.bodies.serial import body_from_arrays, body_to_arrays
 from kinefit.bodies.surfaces import SkinnedMesh

@@ -5,8 +5,16 @@ import pytest
 from tests.oracle import random_body
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.morphs.morphing import GlobalMorph, JointMotion, LocalMorph, Morphing, radial_basis
-from kinefit.bodies.morphs.operators import WEIGHTS, Steering, weight_function
+from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.bodies.morphs.operators import (
+    WEIGHTS,
+    GlobalMorph,
+    JointMotion,
+    LocalMorph,
+    Steering,
+    radial_basis,
+    weight_function,
+)
 from kinefit.bodies.surfaces import BodyMesh, SkinnedMesh
 from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.errors import BodyError, ObservationError

@@ -8,8 +8,7 @@ import pytest
 from tests.exporters.report.test_cycles import STRIDE, walk
 
 from kinefit.errors import ExportError
-from kinefit.exporters.gait.files import stride_table, summary, write_gait
-from kinefit.exporters.gait.page import write_gait_page
+from kinefit.exporters.gait.files import stride_table, summary, write_gait, write_gait_page
 from kinefit.exporters.gait.record import gait_record
 
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit import read_markers
-from kinefit.exporters.gait.forces import PERCENT, force_plots, step_forces
-from kinefit.exporters.gait.page import write_gait_page
+from kinefit.exporters.gait.files import PERCENT, force_plots, step_forces, write_gait_page
 from kinefit.exporters.gait.plates import standing_mass
 from kinefit.exporters.gait.record import gait_record
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.exporters.gait.belts import foot_forces, on_belt, plate_of
 
-from kinefit.exporters.gait.forces import step_forces
+from kinefit.exporters.gait.files import step_forces
 from kinefit.exporters.gait.plates import stood_on
 from kinefit.exporters.gait.record import gait_record
 from kinefit.exporters.report.feet import BELT_STD, footing

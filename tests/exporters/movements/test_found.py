@@ -6,7 +6,7 @@ from tests.exporters.movements.synthetic import RATE, SEAT, SQUAT, crouching, ju
 
 from kinefit.bodies import load_body
 from kinefit.errors import ObservationError
-from kinefit.exporters.movements.found import find_movements, movement_table
+from kinefit.exporters.movements import find_movements, movement_table
 from kinefit.simulation import known_motion
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from tests.exporters.movements.synthetic import SQUAT, crouching, jumping, times_down
 
-from kinefit.exporters.movements.course import Course
-from kinefit.exporters.movements.found import jumps
+from kinefit.exporters.movements import Course, jumps
 
 
 @pytest.mark.parametrize("speed", [1.8, 2.5, 3.2])

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from tests.exporters.movements.synthetic import SEAT, SQUAT, crouching, times_down
 
-from kinefit.exporters.movements.course import Course
-from kinefit.exporters.movements.found import rises
+from kinefit.exporters.movements import Course, rises
 
 
 def test_rises_are_counted_and_timed():

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from tests.exporters.movements.synthetic import SEAT, SQUAT, crouching, jumping, times_down
 
-from kinefit.exporters.movements.course import Course, Repetition
-from kinefit.exporters.movements.found import squats
+from kinefit.exporters.movements import Course, Repetition, squats
 
 
 @pytest.mark.parametrize("count", [1, 3])

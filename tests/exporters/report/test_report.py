@@ -14,7 +14,6 @@ from kinefit.bodies import load_body
 from kinefit.bodies.motion import Residuals, rotation_between_up
 from kinefit.errors import ExportError
 from kinefit.exporters.report.fit import overall_median, sensor_fits
-from kinefit.exporters.report.flagged import close_up, report_frames
 from kinefit.exporters.report.methods import lengths_table, methods_sentences
 from kinefit.exporters.report.moments import (
     doubtful_moments,
@@ -25,7 +24,7 @@ from kinefit.exporters.report.moments import (
     throughout_sentence,
 )
 from kinefit.exporters.report.page import band, thinned
-from kinefit.exporters.report.report import trust_sentence, write_report
+from kinefit.exporters.report.report import close_up, report_frames, trust_sentence, write_report
 from kinefit.exporters.tables import curves
 from kinefit.findings import listed, runs_of
 from kinefit.geometry import se3

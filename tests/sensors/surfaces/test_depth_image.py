@@ -10,8 +10,8 @@ from tests.oracle import central_differences, design
 from tests.sensors.scenes import at, ring
 
 from kinefit.bodies import load_body
-from kinefit.bodies.morphs.morphing import JointMotion, Morphing
-from kinefit.bodies.morphs.operators import Steering
+from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.bodies.morphs.operators import JointMotion, Steering
 from kinefit.bodies.rendering import Canvas, render_body
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry.camera import Rig

@@ -21,8 +21,8 @@ from tests.oracle import (
 
 import kinefit.solving.correspondences as correspondences
 from kinefit.bodies import BodyState, PointSet, TaperedCylinder, load_body
-from kinefit.bodies.morphs.morphing import JointMotion, LocalMorph, Morphing
-from kinefit.bodies.morphs.operators import Steering
+from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.bodies.morphs.operators import JointMotion, LocalMorph, Steering
 from kinefit.bodies.surfaces import Metaballs, SkinnedMesh
 from kinefit.bodies.tree import Closure
 from kinefit.errors import KinefitError

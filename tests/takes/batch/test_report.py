@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from kinefit.exporters.report.flagged import report_frames
+from kinefit.exporters.report.report import report_frames
 from kinefit.readers.take.file import read_take
 from kinefit.takes.batch.results import provenance, take_pictures, write_track_report
 from kinefit.takes.track import track_take

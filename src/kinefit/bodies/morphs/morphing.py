@@ -15,27 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.morphs.operators import (
-    GlobalMorph,
-    JointMotion,
-    LocalMorph,
-    Operator,
-    SegmentMorph,
-    Steering,
-    radial_basis,
-)
-from kinefit.bodies.surfaces.mesh import BodyMesh, MeshSurface, triangles
+from kinefit.bodies.morphs import operators as kinds
+from kinefit.bodies.surfaces import BodyMesh, MeshSurface, SkinnedMesh, triangles
 from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
-from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
 from kinefit.bodies.tree import BodyState
 from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3
-
-__all__ = [
-    "GlobalMorph", "JointMotion", "LocalMorph", "MorphedPose", "Morphing", "Operator", "SegmentMorph",
-    "radial_basis",
-]
 
 _AROUND, _ALONG = 20, 6  # nodes of cylinders, see `body_mesh`
 _MIN_BULGE = 1e-8  # of a radial basis function: derivatives of smaller values are ignored
@@ -67,7 +53,7 @@ class Morphing:
         self,
         body: Body,
         mesh: BodyMesh | SkinnedMesh | None = None,
-        operators: Sequence[Operator] | None = None,
+        operators: Sequence[kinds.Operator] | None = None,
         parameters: NDArray | None = None,
     ) -> None:
         self.body = body
@@ -82,22 +68,22 @@ class Morphing:
             if o.steering.coordinate not in tree.coordinates:
                 name = o.steering.coordinate
                 raise BodyError(choices(f"angle of body '{body.name}' named", name, tree.coordinates))
-        motions = [(o, tree.segment(o.segment)) for o in self.operators if isinstance(o, JointMotion)]
+        motions = [(o, tree.segment(o.segment)) for o in self.operators if isinstance(o, kinds.JointMotion)]
         if any(s == 0 for _, s in motions):
             raise BodyError("the root has no joint that could move", remedy="Name a segment that has a joint.")
-        self._motions: dict[int, list[JointMotion]] = {}
+        self._motions: dict[int, list[kinds.JointMotion]] = {}
         for o, s in motions:
             self._motions.setdefault(s, []).append(o)
-        self._fields: list[tuple[Steering, NDArray]] = []
+        self._fields: list[tuple[kinds.Steering, NDArray]] = []
         # Bulges of one function r, at rest, that act together; nodes, their shares, and the segment that carries them.
-        self._bulges: list[tuple[list[LocalMorph], NDArray, NDArray, int | None]] = []
-        together: dict[object, list[LocalMorph]] = {}
+        self._bulges: list[tuple[list[kinds.LocalMorph], NDArray, NDArray, int | None]] = []
+        together: dict[object, list[kinds.LocalMorph]] = {}
         for o in self.operators:
-            if isinstance(o, GlobalMorph):
+            if isinstance(o, kinds.GlobalMorph):
                 self._fields.append((o.steering, o.field(x, parameters)))
-            elif isinstance(o, SegmentMorph):
+            elif isinstance(o, kinds.SegmentMorph):
                 self._fields.append((o.steering, self._segment_field(o)))
-            elif isinstance(o, LocalMorph) and (o.moves or o.deforms):
+            elif isinstance(o, kinds.LocalMorph) and (o.moves or o.deforms):
                 carrier, share = tree.segment(str(o.segment)) if o.moves else None, self._node_shares(o)[:, 0]
                 one = (carrier, o.on, *(np.asarray(v, float).tobytes() for v in (o.centre, o.radii, o.tilt)))
                 bulges = together.setdefault(id(o) if o.deforms else one, [])
@@ -105,7 +91,7 @@ class Morphing:
                 if len(bulges) == 1:
                     nodes = np.flatnonzero(share)
                     self._bulges.append((bulges, nodes, share[nodes], carrier))
-            elif isinstance(o, LocalMorph):
+            elif isinstance(o, kinds.LocalMorph):
                 self._fields.append((o.steering, self._node_shares(o) * o.placed(tree).field(x, parameters)))
         above = np.eye(len(tree.segments), dtype=bool)
         for s in range(1, len(tree.segments)):
@@ -146,14 +132,14 @@ class Morphing:
             out.append(smooth)
         return [*out, self]
 
-    def _node_shares(self, morph: LocalMorph) -> NDArray:
+    def _node_shares(self, morph: kinds.LocalMorph) -> NDArray:
         """Share (V, 1) of each node that belongs to segments of a local morph."""
         if not morph.on:
             return np.ones((len(self.skin.nodes), 1))
         chosen = np.isin(self.skin.owners, [self.body.tree.segment(name) for name in morph.on])
         return np.sum(self.skin.weights * chosen, 1, keepdims=True)
 
-    def _segment_field(self, morph: SegmentMorph) -> NDArray:
+    def _segment_field(self, morph: kinds.SegmentMorph) -> NDArray:
         """Shifts (V, 3) [m] from a segment's surfaces to their second shape, for the mesh of the body's surfaces."""
         here, body = self.body.tree.segment(morph.segment), self.body
         place, remedy = f"morph of {morph.segment}", "Give one for each of the segment's surfaces, of the same kind."
@@ -174,7 +160,7 @@ class Morphing:
             first += len(v)
         return out
 
-    def _weight_of(self, steering: Steering, state: BodyState) -> tuple[int, float, float]:
+    def _weight_of(self, steering: kinds.Steering, state: BodyState) -> tuple[int, float, float]:
         d = self.body.tree.coordinate(steering.coordinate)
         return (d, *steering.at(float(state.angles[d])))
 
@@ -223,7 +209,7 @@ class Morphing:
         return MorphedPose(self, state, frames, screws, shift, tuple(drives))
 
     def _carried(
-        self, bulges: Sequence[LocalMorph], nodes: NDArray, bone: int | None, frames: NDArray
+        self, bulges: Sequence[kinds.LocalMorph], nodes: NDArray, bone: int | None, frames: NDArray
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Bulges that move with a bone, r(y) of nodes y in the bone's frame in this pose, or that deform.
 

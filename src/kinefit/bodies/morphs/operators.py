@@ -19,8 +19,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit.bodies.surfaces.cylinder import TaperedCylinder
-from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces import MeshSurface, TaperedCylinder
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError, check_choice
 from kinefit.geometry import se3

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, MeshSurface, TaperedCylinder, load_body
 from kinefit.bodies.motion import BELIEVED
 from kinefit.bodies.surfaces import Metaballs
+from kinefit.bodies.surfaces.mesh import tube_faces
 from kinefit.bodies.surfaces.skins.body_skin import MAX_OWNERS, BodySkin, body_skins
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh, strongest
 
@@ -193,14 +194,14 @@ def _tube(body: Body, c: TaperedCylinder) -> TubeMesh:
     points = along[:, None, None] * u + radius[:, None, None] * np.einsum("rk,kai->rai", flat, out)
     normals = np.sin(slope)[:, None, None] * u + np.cos(slope)[:, None, None] * np.einsum("rk,kai->rai", 1 / flat, out)
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    vertices = np.concatenate([[along[0] * u], points[1:-1].reshape(-1, 3), [along[-1] * u]])
-    heights = np.concatenate([[along[0]], np.repeat(along[1:-1], AROUND), [along[-1]]])
+    vertices = np.concatenate([points[1:-1].reshape(-1, 3), along[[0, -1], None] * u])
+    heights = np.concatenate([np.repeat(along[1:-1], AROUND), along[[0, -1]]])
     segments, weights = _weights(body, c, heights, length)
     return TubeMesh(
         vertices=vertices + start + tree.rest[c.segment],
-        normals=np.concatenate([[-u], normals[1:-1].reshape(-1, 3), [u]]),
+        normals=np.concatenate([normals[1:-1].reshape(-1, 3), [-u, u]]),
         colours=np.tile(np.array(side_colour(tree.segments[c.segment]), np.uint8), (len(vertices), 1)),
-        triangles=_triangles(len(along) - 2),
+        triangles=tube_faces(len(along) - 3, AROUND),
         segments=segments,
         weights=weights,
     )
@@ -216,18 +217,6 @@ def _profile(length: float, start: float, end: float) -> tuple[NDArray, NDArray,
     along = np.concatenate([start * np.sin(first), a0 + t * (a1 - a0), length + end * np.sin(last)])
     radius = np.concatenate([start * np.cos(first), r0 + t * (r1 - r0), end * np.cos(last)])
     return along, radius, np.concatenate([first, np.full(ALONG, tilt), last])
-
-
-def _triangles(rings: int) -> NDArray:
-    """Vertices: pole, `rings` rings of AROUND, pole."""
-    i, j = np.meshgrid(np.arange(rings - 1), np.arange(AROUND), indexing="ij")
-    a, b = 1 + i * AROUND + j, 1 + i * AROUND + (j + 1) % AROUND
-    walls = np.concatenate([np.stack([a, b, b + AROUND], -1), np.stack([a, b + AROUND, a + AROUND], -1)]).reshape(-1, 3)
-    k = np.arange(AROUND)
-    after, top, last = (k + 1) % AROUND, 1 + rings * AROUND, 1 + (rings - 1) * AROUND
-    start = np.stack([np.zeros_like(k), 1 + after, 1 + k], -1)
-    end = np.stack([np.full_like(k, top), last + k, last + after], -1)
-    return np.concatenate([start, walls, end])
 
 
 def _weights(body: Body, c: TaperedCylinder, heights: NDArray, length: float) -> tuple[NDArray, NDArray]:

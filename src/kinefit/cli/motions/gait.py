@@ -42,8 +42,7 @@ def gait(motions: tuple[Path, ...], out: Path | None, report: bool, reference: P
     """
     if reference is not None and not report:
         raise click.UsageError("--reference needs --report: its bands stand on that page.")
-    from kinefit.exporters.gait.files import summary, write_gait
-    from kinefit.exporters.gait.page import write_gait_page
+    from kinefit.exporters.gait.files import summary, write_gait, write_gait_page
     from kinefit.exporters.gait.record import gait_record
     from kinefit.exporters.report.cycles import read_norms
     from kinefit.readers.motion import find_motion, read_motion
@@ -99,7 +98,7 @@ Examples:
 def movements(motion: Path, out: Path | None) -> None:
     """Find jumps, squats and rises from a seat in a fitted motion, each with its times and standard deviations."""
     from kinefit._files import writing
-    from kinefit.exporters.movements.found import find_movements, movement_table
+    from kinefit.exporters.movements import find_movements, movement_table
     from kinefit.exporters.tables import to_csv
     from kinefit.readers.motion import find_motion, read_motion
 

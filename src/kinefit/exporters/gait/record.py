@@ -14,7 +14,7 @@ from kinefit.bodies.lasting_errors import differ
 from kinefit.bodies.motion import Motion, rotation_between_up
 from kinefit.errors import ObservationError
 from kinefit.exporters.report.cycles import Cycles, find_gait, take_turns
-from kinefit.exporters.report.feet import HEEL, MIN_STRIDE_S, Feet, foot_events, foot_findings
+from kinefit.exporters.report.feet import HEEL, MIN_STRIDE_S, Feet, foot_events, foot_findings, upright
 from kinefit.exporters.report.strides import QUANTITIES, Quantity, step_quantities, stride_quantities
 from kinefit.findings import listed
 
@@ -156,13 +156,8 @@ def symmetry(left: Quantity, right: Quantity) -> tuple[float, float]:
 
 def headings(motion: Motion) -> NDArray:
     """(F,) [rad] about the vertical, in which the pelvis faces: 0 along x of a world turned to y up, to the left."""
-    across = np.diff(_upright(motion, ("l_hip", "r_hip")), axis=1)[:, 0]
+    across = np.diff(upright(motion, ("l_hip", "r_hip")), axis=1)[:, 0]
     return np.unwrap(np.arctan2(across[:, 0], across[:, 2]))
-
-
-def _upright(motion: Motion, names: tuple[str, ...]) -> NDArray:
-    """(F, K, 3) [m] landmarks in a world turned to y up."""
-    return motion.positions(motion.body.landmarks.select(names)) @ rotation_between_up(motion.up, "y").T
 
 
 def _walk(name: str, motion: Motion) -> Walk | str:
@@ -196,7 +191,7 @@ def _posture_fault(motion: Motion) -> str:
     lacking = [n for n in names if n not in motion.body.landmarks.names]
     if lacking or len(motion) < 3:
         return f"the body has no landmarks {listed(lacking)}" if lacking else "it has fewer than three frames"
-    heights = _upright(motion, names)[..., 1].reshape(-1, 2, 2)
+    heights = upright(motion, names)[..., 1].reshape(-1, 2, 2)
     height = float(np.median(heights[:, :, 0].mean(axis=1) - heights[:, :, 1].min(axis=1)))
     share = height / (motion.body.stature or 1.7)
     if share < _MIN_UPRIGHT:

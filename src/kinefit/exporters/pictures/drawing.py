@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, PointSet
+from kinefit.bodies import Body, Morphing, PointSet
 from kinefit.bodies.limbs import finger_groups
-from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.motion import OUTLIER_WEIGHT, Motion, Residuals
 from kinefit.bodies.rendering import Canvas, looks
 from kinefit.bodies.surfaces.mesh import MeshSurface
@@ -199,6 +198,14 @@ def draw_dot(image: NDArray, uv: NDArray, radius: float, colour: tuple[int, int,
     if np.isfinite(uv).all() and (np.abs(uv) < _MAX_DRAWN_PX).all():
         x, y, r = (round(float(v) * (1 << _SUBPIXEL_BITS)) for v in (uv[0], uv[1], radius))
         cv2.circle(image, (x, y), r, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def depth_colours(depth: NDArray, near: float, far: float) -> NDArray[np.uint8]:
+    """Depth (H, W) [m] as colours (H, W, 3) RGB: red at `near` [m], blue at `far`, black for pixels without depth."""
+    share = np.clip((far - depth) / (far - near), 0.0, 1.0)
+    out = cv2.applyColorMap((255 * share).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
+    out[depth <= 0.0] = 0
+    return np.asarray(out, np.uint8)
 
 
 def hide_circles(image: NDArray[np.uint8], circles: NDArray) -> NDArray[np.uint8]:

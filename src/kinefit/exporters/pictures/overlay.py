@@ -159,7 +159,7 @@ def draw_overlay(
     drawing.draw_body(out, motion, frame, camera, image_frame)
     if residuals is not None:
         drawing.draw_residuals(out, residuals, frame, image_frame)
-        lines.append((_told(residuals, frame), drawing.WHITE))
+        lines.append((_residual_text(residuals, frame), drawing.WHITE))
     drawing.write_lines(out, lines + [(note, _NOTE) for note in _notes(motion, residuals, frame)])
     return out
 
@@ -184,7 +184,7 @@ def write_montage(
     write_image(path, np.concatenate(row[1:], axis=1)[..., ::-1])
 
 
-def _told(residuals: Residuals, frame: int) -> str:
+def _residual_text(residuals: Residuals, frame: int) -> str:
     norms = residuals.norms[frame]
     seen = np.isfinite(norms)
     used = seen & ~residuals.rejected[frame]
@@ -215,7 +215,7 @@ def _encoder(
     if codec is None:
         raise ExportError(f"FFmpeg has none of the codecs {', '.join(_CODECS)}", file=path)
     exact, numbers = Fraction(rate).limit_denominator(10000), count()
-    container = _told_by_system(av.open, str(temporary), "w")
+    container = _with_system_errors(av.open, str(temporary), "w")
     stream = container.add_stream(codec, rate=exact, options=_CODECS[codec])
     (stream.width, stream.height), stream.pix_fmt, stream.codec_context.time_base = size, "yuv420p", _TICK
 
@@ -224,7 +224,7 @@ def _encoder(
         frame, number = av.VideoFrame.from_ndarray(planes, format="yuv420p"), next(numbers)
         frame.time_base, frame.pts = _TICK, round((number / exact if time is None else time) / _TICK)
         for packet in stream.encode(frame):
-            _told_by_system(container.mux, packet)
+            _with_system_errors(container.mux, packet)
 
     try:
         yield encode
@@ -233,11 +233,11 @@ def _encoder(
             container.close()
         raise
     for packet in stream.encode():
-        _told_by_system(container.mux, packet)
-    _told_by_system(container.close)
+        _with_system_errors(container.mux, packet)
+    _with_system_errors(container.close)
 
 
-def _told_by_system(call: Callable, *args: Any) -> Any:
+def _with_system_errors(call: Callable, *args: Any) -> Any:
     """The call; FFmpeg's errors become the system's, a muxer that cannot go on counts as a full disk."""
     try:
         return call(*args)
@@ -278,9 +278,7 @@ def depth_picture(
     if frame is not None:
         raster = render_body(motion.body, motion.state(frame), large)
         middle = float(np.median(raster.depth[raster.seen])) if raster.seen.any() else middle
-    shade = np.clip((middle + _COLOUR_RANGE_M - depth) / (2.0 * _COLOUR_RANGE_M), 0.0, 1.0)
-    picture = cv2.applyColorMap((255 * shade).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
-    picture = np.where((depth > 0)[..., None], picture, 0).astype(np.uint8)
+    picture = drawing.depth_colours(depth, middle - _COLOUR_RANGE_M, middle + _COLOUR_RANGE_M)
     out = np.ascontiguousarray(np.repeat(np.repeat(picture, times, axis=0), times, axis=1))
     if raster is not None and frame is not None:
         part, lost = raster.segment, np.append(motion.lost[frame], False)  # -1, the background, is not lost

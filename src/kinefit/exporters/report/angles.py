@@ -364,12 +364,6 @@ def all_ranges(motion: Motion) -> list[AngleRange]:
     return out
 
 
-def short_table(found: Sequence[AngleRange]) -> p.Html:
-    """Ranges, left beside right, and their difference."""
-    columns = ["range of motion [°]", "left", "right", "middle", "left minus right"]
-    return p.table(columns, [one.row for one in found])
-
-
 def _difference(motion: Motion, left: Extremes | None, right: Extremes | None) -> tuple[float, float] | None:
     """AngleRange of the left side minus that of the right, with two standard deviations [deg]."""
     if left is None or right is None:

@@ -27,7 +27,7 @@ MIN_STRIDE_S = 0.4  # [s]: sprinters take 0.45 s
 BELT_STD = 0.013  # [m/s] of a belt's velocity: the root mean square in ten walks of four people, as if on a belt
 HEEL, BALL, TOE = "heel", ("metatarsal_phalanx_1", "metatarsal_phalanx_5"), "digit_1"  # of a foot, after "l_", "r_"
 _CONTACT_SHARE, _OFF_SHARE = 0.1, 0.18  # of the swing's highest speed: no error against plates in the mean of five
-# people (HC002D, HC036A and HC050A, the adult and the sprinter of forces_nimblephysics), each of whom counts once
+# people (HC002D, HC036A and HC050A, the adult and the sprinter of forces_nimblephysics); each person counts once
 _CONTACT_STD_S, _OFF_STD_S = 0.013, 0.0105  # of the next person: 7.8 and 5.5 ms between these people, as Student's t
 # of five predicts another, 5.6 and 6.5 ms within one
 _MARKED_STD_S = 0.009  # of laboratories' own events: they differ by 12.5 ms from ours, which are right to 8.5 ms, there
@@ -128,8 +128,7 @@ def feet_alone(motion: Motion) -> Feet | None:
     names = [f"{s}_{n}" for s in "lr" for n in ("hip", HEEL, *BALL, TOE)]
     if any(name not in motion.body.landmarks.names for name in names) or len(motion) < 3:
         return None
-    upright = motion.positions(motion.body.landmarks.select(tuple(names))) @ rotation_between_up(motion.up, "y").T
-    hips, heels, first, fifth, toes = np.moveaxis(upright.reshape(len(motion), 2, 5, 3), 2, 0)
+    hips, heels, first, fifth, toes = np.moveaxis(upright(motion, names).reshape(len(motion), 2, 5, 3), 2, 0)
     feet = np.stack([heels, 0.5 * (first + fifth), toes], axis=2)  # (F, side, heel, ball and toe, 3)
     across = hips[:, 1] - hips[:, 0]
     forward = np.cross([0.0, 1.0, 0.0], across)
@@ -146,6 +145,11 @@ def feet_alone(motion: Motion) -> Feet | None:
     ahead = (-ahead if backwards else ahead) * observed[:, None]  # of a leg that was not measured nothing is known
     left, right = (_events(motion, name, ahead[:, s], speed[:, s], least) for s, name in enumerate(("left", "right")))
     return Feet(left, right, belt, (bool(observed[0]), bool(observed[1])), backwards)
+
+
+def upright(motion: Motion, names: Sequence[str]) -> NDArray:
+    """(F, K, 3) [m] landmarks in a world turned to y up."""
+    return motion.positions(motion.body.landmarks.select(tuple(names))) @ rotation_between_up(motion.up, "y").T
 
 
 def foot_findings(motion: Motion) -> tuple[Finding, ...]:

@@ -330,14 +330,6 @@ def picture(
     return np.clip(np.round(colour + sensor.noise * noise), 0, 255).astype(np.uint8)
 
 
-def depth_picture(depth: NDArray, near: float, far: float) -> NDArray:
-    """Depth (H, W) [m] as colours (H, W, 3) BGR 8 bit: near red, far blue, black for pixels without depth."""
-    share = np.clip((far - depth) / (far - near), 0.0, 1.0)
-    out = cv2.applyColorMap((255 * share).astype(np.uint8), cv2.COLORMAP_TURBO)
-    out[depth <= 0.0] = 0
-    return out
-
-
 def _shaded(scene: SimulatedScene, view: RenderedView) -> NDArray:
     """(H, W, 3) float32 BGR without noise."""
     names = [*map(_colour_name, scene.motion.body.tree.segments), *PARTS]

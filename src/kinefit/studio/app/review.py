@@ -19,9 +19,7 @@ from kinefit.errors import ObservationError
 from kinefit.exporters.pictures.overlay import draw_overlay
 from kinefit.exporters.report.angles import RangeChange, all_ranges, range_changes, with_error
 from kinefit.exporters.tables import curves, spoken
-from kinefit.readers.motion import read_motion
-from kinefit.readers.take.file import read_take
-from kinefit.readers.take.load import load_observations
+from kinefit.readers import load_observations, read_motion, read_take
 from kinefit.studio.app.people import ShownVideos
 from kinefit.studio.serving.access import APP_PAGES, Access
 from kinefit.studio.serving.server import Page, PageServer

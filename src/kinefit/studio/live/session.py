@@ -16,9 +16,8 @@ import numpy as np
 from kinefit.bodies import Body, catalogue, load_body
 from kinefit.errors import BodyError, KinefitError, ObservationError, check_choice, choices
 from kinefit.exporters.motion_file import hello
-from kinefit.fitting.frame.results import FrameResult
+from kinefit.fitting import FrameResult, Tracker
 from kinefit.fitting.tracking.motions import axis_of
-from kinefit.fitting.tracking.tracker import Tracker
 from kinefit.observations import Keypoints
 from kinefit.studio.live.cameras import Arrived, Inbox, LiveDetector
 from kinefit.studio.live.folders import REPLAY

@@ -19,13 +19,11 @@ from kinefit.images.depth_scene import background_model
 from kinefit.images.detectors.box_detector import Models
 from kinefit.markers.take.takes import with_names
 from kinefit.observations import KEYPOINT_SIGMA
-from kinefit.readers.depth.recordings import read_depth
-from kinefit.readers.motion import read_motion
+from kinefit.readers import load_observations, read_depth, read_motion
 from kinefit.readers.take.cameras import assumed_camera, image_frame, is_alone, read_rig
 from kinefit.readers.take.checks import streams_of
 from kinefit.readers.take.depth import stated_camera
 from kinefit.readers.take.entries import CameraEntry, DepthEntry, Take
-from kinefit.readers.take.load import load_observations
 from kinefit.studio.live.cameras import CameraStream, LiveDetector, SessionClock, VideoReplay
 from kinefit.studio.live.folders import DepthFolderStream, ImageFolderStream, KeypointFolderStream, Replay
 from kinefit.studio.live.people import LivePerson, LiveSize

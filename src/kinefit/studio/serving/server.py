@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
-from websockets.frames import CloseCode, Frame
+from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from kinefit.errors import ExportError
@@ -103,8 +103,8 @@ class Connection(ServerConnection):
                 super().data_received(part)
 
     def process_event(self, event: Any) -> None:
-        """Count frames of every kind: messages, parts of them, pings."""
-        if not isinstance(event, Frame) or self._count(1.0):
+        """Count frames of every kind, after the handshake: messages, parts of them, pings."""
+        if self.request is None or self._count(1.0):
             super().process_event(event)
 
     def _count(self, cost: float) -> bool:

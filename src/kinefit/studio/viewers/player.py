@@ -41,7 +41,7 @@ class PlaybackClock:
     def tick(self, elapsed: float) -> None:
         """Let `elapsed` seconds pass."""
         if self.playing:
-            self.position = scene.advance(self.position, elapsed, rate=self.rate, speed=self.speed, count=self.count)
+            self.position = (self.position + elapsed * self.rate * self.speed) % max(self.count, 1)
 
     def step(self, frames: int) -> None:
         """Stop, and go some frames on or back, round the ends."""

@@ -160,12 +160,6 @@ def camera_rays(
     return Rays(points, np.repeat(np.tile(colours, (2, 1))[:, None], 2, axis=1))
 
 
-def root_path(motion: Motion) -> NDArray:
-    """(F - 1, 2, 3) [m] way of the root."""
-    x = motion.Ts_world_root[:, :3, 3]
-    return np.stack([x[:-1], x[1:]], axis=1)
-
-
 def floor_height(points: NDArray, up: str) -> float:
     """[m] along the vertical axis where to draw the floor under points (N, 3).
 
@@ -206,8 +200,3 @@ def angle_course(motion: Motion, coordinate: str) -> tuple[NDArray, NDArray, str
 def as_markdown(name: str) -> str:
     """Markdown that shows a name of a file as it is: without elements, links, images, code and emphasis of its own."""
     return re.sub(r"([\\`*\[\]()<>!&#|~])", r"\\\1", name)
-
-
-def advance(position: float, elapsed: float, *, rate: float, speed: float, count: int) -> float:
-    """Place in a loop of `count` frames after `elapsed` seconds at `speed` times the real one; [frames]."""
-    return (position + elapsed * rate * speed) % max(count, 1)

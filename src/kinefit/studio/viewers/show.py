@@ -173,7 +173,8 @@ class Show:
         for n, motion in enumerate(recording.motions):
             colour = None if n == 0 else scene.OTHERS[(n - 1) % len(scene.OTHERS)]
             self.figures.append(figure.Figure(server.scene, f"body{n}", motion.body, colour=colour))
-            path = scene.root_path(motion)
+            way = motion.Ts_world_root[:, :3, 3]
+            path = np.stack([way[:-1], way[1:]], axis=1)
             if len(path):
                 shade: Any = _PATH if colour is None else colour
                 self._paths.append(server.scene.add_line_segments(f"/world/path{n}", path, shade, thickness=0.008))

@@ -280,7 +280,7 @@ def take_pictures(
 
     Frames outside a camera's video are omitted.
     """
-    from kinefit.exporters.report.flagged import close_up, report_frames
+    from kinefit.exporters.report.report import close_up, report_frames
 
     out: dict[str, dict[int, NDArray[np.uint8]]] = {}
     if seen.rig is None:

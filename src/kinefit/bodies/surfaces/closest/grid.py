@@ -81,17 +81,12 @@ def cell_size(corners: NDArray, cells: int = GRID_CELLS, margin: float = MARGIN)
 
 def parts(faces: NDArray) -> list[NDArray]:
     """Connected parts of faces (T, 3) or edges (E, 2): indices of each; faces that share a corner are connected."""
-    label = np.arange(int(faces.max()) + 1)
-    while True:
-        least = label[faces].min(1)
-        new = label.copy()
-        for k in range(faces.shape[1]):
-            np.minimum.at(new, faces[:, k], least)
-        new = new[new]
-        if np.array_equal(new, label):
-            break
-        label = new
-    of_face = label[faces[:, 0]]
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    first, others = np.repeat(faces[:, 0], faces.shape[1] - 1), faces[:, 1:].ravel()
+    joins = coo_array((np.ones(len(first), bool), (first, others)), shape=(int(faces.max()) + 1,) * 2)
+    of_face = connected_components(joins, directed=False)[1][faces[:, 0]]
     return [np.flatnonzero(of_face == name) for name in np.unique(of_face)]
 
 

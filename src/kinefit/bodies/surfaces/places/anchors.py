@@ -77,13 +77,8 @@ class SurfaceAnchors:
         if self._latest and self._latest[0][0] is body:
             return self._latest[0][1]
         _check_correspondence(self.body, body)
-        places, points, J = self._places, np.empty((len(self), 3)), np.empty((len(self), 3, 3))
-        table = _cylinders(body)
-        round_ones = table.is_cylinder[places.surface]
-        points[round_ones], J[round_ones] = table.mapped(places.surface[round_ones], places.at[round_ones])
-        for k in np.unique(places.surface[~round_ones]):
-            own = places.surface == k
-            points[own], J[own] = _mapped(body.surfaces[k], places.face[own], places.at[own])
+        places = self._places
+        points, J = _mapped(body, places.surface, places.face, places.at)
         points += body.tree.rest[self.segment]
         normals = np.linalg.solve(np.swapaxes(J, 1, 2), places.normal[..., None])[..., 0]
         size = np.linalg.norm(self.normals, axis=1) / np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
@@ -112,10 +107,8 @@ class SurfaceAnchors:
         if count and out.surface.min() < 0:
             name = body.tree.segments[int(self.segment[np.argmin(out.surface)])]
             raise BodyError(f"segment '{name}' has no surface for anchors", remedy="Give it a surface.")
-        for k in np.unique(out.surface):
-            own = out.surface == k
-            _, J = _mapped(body.surfaces[k], out.face[own], out.at[own])
-            out.normal[own] = np.einsum("nji,nj->ni", J, self.normals[own])
+        _, J = _mapped(body, out.surface, out.face, out.at)
+        out.normal[:] = np.einsum("nji,nj->ni", J, self.normals)
         return out
 
 
@@ -155,18 +148,16 @@ def _cylinders(body: Body) -> _Cylinders:
     return out
 
 
-def _mapped(surface: TaperedCylinder | MeshSurface, face: NDArray, at: NDArray) -> tuple[NDArray, NDArray]:
-    """Points (N, 3) [m] in the segment's frame from coordinates (N, 3), and derivatives (N, 3, 3) by them."""
-    if isinstance(surface, MeshSurface):
-        corner, J = _face_axes(surface, face)
-        return corner + np.einsum("nij,nj->ni", J, at), J
-    first, last = np.array(surface.radii)
-    half = first + at[:, 2:] * (last - first)
-    axes, J = surface.axes, np.zeros((len(at), 3, 3))
-    local = np.concatenate([half * at[:, :2], surface.length * at[:, 2:]], axis=1)
-    J[:, 0, 0], J[:, 1, 1], J[:, 2, 2] = half[:, 0], half[:, 1], surface.length
-    J[:, :2, 2] = (last - first) * at[:, :2]
-    return local @ axes + surface.start, axes.T @ J
+def _mapped(body: Body, surface: NDArray, face: NDArray, at: NDArray) -> tuple[NDArray, NDArray]:
+    """Points (N, 3) [m] in their segments' frames from coordinates (N, 3), and derivatives (N, 3, 3) by them."""
+    points, J, table = np.empty((len(at), 3)), np.empty((len(at), 3, 3)), _cylinders(body)
+    own = table.is_cylinder[surface]
+    points[own], J[own] = table.mapped(surface[own], at[own])
+    for k in np.unique(surface[~own]):
+        own = surface == k
+        corner, J[own] = _face_axes(body.surfaces[k], face[own])
+        points[own] = corner + np.einsum("nij,nj->ni", J[own], at[own])
+    return points, J
 
 
 def _placed(surface: TaperedCylinder | MeshSurface, x: NDArray) -> tuple[NDArray, NDArray, NDArray]:

@@ -1,1 +1,0 @@
-"""Jumps, squats and sit to stand: counted and timed, one file a movement."""
