@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from types import MappingProxyType
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +23,8 @@ _MIN_DURATION = 0.2  # [s] the same
 
 def detect_people(
     images: Iterable[NDArray[np.uint8]], models: Models | TopDownModels, *, camera: str, rate: float, people: int = 3,
-    masks: bool = True, with_hands: Adder | None = None, with_faces: Adder | None = None, looks: range | None = None,
+    masks: bool = True, adders: Mapping[Literal["hands", "face"], Adder] = MappingProxyType({}),
+    looks: range | None = None,
 ) -> Detections:  # fmt: skip
     """Detect and track people in a video: keypoints and masks.
 
@@ -35,8 +38,8 @@ def detect_people(
         Largest number of people at a time.
     masks : bool
         Whether masks are computed, by networks that give them.
-    with_hands, with_faces : callable, optional
-        Adds hands, or faces, to the people in an image: a `HandFollower`, a `FaceFinder`.
+    adders : {"hands": `HandFollower`, "face": `FaceFinder`}
+        Callables that add hands, or faces, to the people in an image; in this order.
     looks : range, optional
         Numbers of the images that are looked at for certain, others only where the motion or the people ask for it.
         Default: all are looked at.
@@ -56,7 +59,7 @@ def detect_people(
             yield image
 
     def add(image: NDArray[np.uint8], detected: list[PersonDetection]) -> list[PersonDetection]:
-        for adder in filter(None, (with_hands, with_faces)):
+        for adder in adders.values():
             detected = adder(image, detected)
         return detected
 
@@ -81,8 +84,8 @@ def detect_people(
             if s.lifted is not None:
                 lifted[at] = s.lifted
             runs.append(s.runs)
-    hands, hand_confidence = _stacked(frames, column, "hands", (2, 21)) if with_hands else (None, None)
-    face, face_confidence = _stacked(frames, column, "face", (478,)) if with_faces else (None, None)
+    hands, hand_confidence = _stacked(frames, column, "hands", (2, 21)) if "hands" in adders else (None, None)
+    face, face_confidence = _stacked(frames, column, "face", (478,)) if "face" in adders else (None, None)
     return Detections(
         camera, rate, size, points, confidence, np.concatenate(runs), np.concatenate([[0], np.cumsum(counts)]), "",
         lifted if layout.has_masks else None, hands, hand_confidence, None, face, face_confidence,

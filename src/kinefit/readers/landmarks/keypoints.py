@@ -128,17 +128,17 @@ def read_openpose(
     paths, start = cut_frames(_numbered_files(folder), frames, folder)
     people = [decoded(path, decode_openpose, "openpose") for path in paths]
     places = [(path, "") for path in paths]
-    return people_record(people, places, folder, camera, rate, keypoint_set, time_offset, start, image_frame)
+    record = people_record(people, places, folder, camera, rate, keypoint_set, start)
+    return _calibrated(record, time_offset, image_frame)
 
 
 def people_record(
     people: Sequence[Sequence[OpenPosePerson]], places: Sequence[tuple[Path, str]], source: Path, camera: str,
-    rate: float, keypoint_set: str | None, time_offset: float = 0.0, start: int = 0,
-    image_frame: ImageFrame | None = None,
+    rate: float, keypoint_set: str | None, start: int = 0,
 ) -> Keypoints:  # fmt: skip
     """The record of all people of every frame; `places` of the frames are their files and places there, for messages.
 
-    Others as in `read_openpose`, whose errors it raises.
+    `start` is the number of the first frame; others as in `read_openpose`, whose errors it raises.
     """
     if not any(people) and (source.is_dir() or len(people) != 1):
         raise _nobody(len(people), camera)
@@ -146,8 +146,14 @@ def people_record(
     named = keypoint_set or SET_OF_COUNT.get(first, "BODY_25B")
     numbers = [_numbers(persons, *place, named) for persons, place in zip(people, places, strict=True)]
     data = stacked(numbers, len(keypoint_names(named)))
-    record = keypoint_record(data, camera, named, rate, time_offset, start, source, image_frame)
+    record = keypoint_record(data, camera, named, rate, source, start=start)
     return in_right_order(record, stated=keypoint_set is not None)
+
+
+def _calibrated(record: Keypoints, time_offset: float, image_frame: ImageFrame | None) -> Keypoints:
+    """The record on the clock of all cameras, `time_offset` [s] later, and in the pixels of the calibration's image."""
+    points = record.points if image_frame is None else sealed(kept(image_frame.to_calibration(record.points)))
+    return replace(record, points=points, time_offset=record.time_offset + time_offset)
 
 
 def _nobody(frames: int, camera: str) -> ObservationError:
@@ -203,7 +209,8 @@ def read_mediapipe(
         data = face_mesh(data)
     if not data[..., 2].any():
         raise _nobody(len(data), camera)
-    return keypoint_record(data[:, None], camera, keypoint_set, rate, time_offset, start, path, image_frame)
+    record = keypoint_record(data[:, None], camera, keypoint_set, rate, path, start=start)
+    return _calibrated(record, time_offset, image_frame)
 
 
 _CALISCOPE_HANDS = (100, 200)  # first indices of the right and of the left hand
@@ -260,7 +267,7 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
         data = np.zeros((frame.max() + 1, 1, len(KEYPOINT_SETS[keypoint_set]), 3))
         rows = port == p
         data[frame[rows], 0, point[rows]] = np.column_stack([table[rows, 4:6], np.ones(rows.sum())])
-        keypoints[f"cam_{p}"] = keypoint_record(data, f"cam_{p}", keypoint_set, rate, 0.0, 0, path, None)
+        keypoints[f"cam_{p}"] = keypoint_record(data, f"cam_{p}", keypoint_set, rate, path)
     return keypoints
 
 
@@ -303,8 +310,7 @@ def read_keypoints(
         "read", path, camera=camera, rate=rate, **options, what=f"Keypoints of the camera '{camera}' at {rate} Hz",
         valid=lambda one: isinstance(one, Keypoints) and one.camera == camera and rate in (None, one.rate),
     )  # fmt: skip
-    points = record.points if image_frame is None else sealed(kept(image_frame.to_calibration(record.points)))
-    return replace(record, points=points, time_offset=record.time_offset + time_offset)
+    return _calibrated(record, time_offset, image_frame)
 
 
 def _is_caliscope(path: Path) -> bool:
@@ -348,7 +354,7 @@ def _freemocap_camera(path: Path, *, camera: str, rate: float | None, keypoint_s
     seen = np.isfinite(uv).all(axis=-1, keepdims=True)
     whole = np.where(seen, np.concatenate([uv, seen], axis=-1), 0.0)[:, None]
     name = FACE_SET if face else MEDIAPIPE_SETS[int(data.shape[2] > pose)]
-    return keypoint_record(whole, camera, name, rate or 1.0, 0.0, 0, path, None)
+    return keypoint_record(whole, camera, name, rate or 1.0, path)
 
 
 _OTHER_FILES = {  # what such a file has near its start, after spaces: what it is

@@ -26,7 +26,7 @@ from kinefit.readers.plugins import FileFormat
 Table = tuple[Sequence[str], NDArray]  # names of the points, and (F, P, K, 3) x, y [px], confidence; NaN where unseen
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _MAX_BYTES = 2**32  # of an array, which a damaged file may declare to be larger than memory
-_AGAIN = "Export it again."
+_EXPORT_AGAIN = "Export it again."
 
 
 @checked
@@ -38,26 +38,27 @@ def _read(
     """The keypoints of a file, as points of a known set or of one of the user's own; see `read_keypoints`."""
     own, data = table(path)
     if data.shape[2] != len(own):
-        raise FileError(f"{len(own)} names of {data.shape[2]} points", remedy=_AGAIN)
+        raise FileError(f"{len(own)} names of {data.shape[2]} points", remedy=_EXPORT_AGAIN)
     data = np.where(np.isfinite(data).all(axis=-1, keepdims=True), data, 0.0)
     if not data.any():
-        raise ObservationError(f"no point of camera {camera} is seen in any of {len(data)} frames", remedy=_AGAIN)
+        problem = f"no point of camera {camera} is seen in any of {len(data)} frames"
+        raise ObservationError(problem, remedy=_EXPORT_AGAIN)
     for name in names or ():
         check_choice("point in this file named", name, own, ObservationError)
     renamed = [(names or {}).get(name, name) for name in own]
     kept, chosen = [k for k, name in enumerate(renamed) if name], [name for name in renamed if name]
     if keypoint_set is not None and keypoint_set not in KEYPOINT_SETS:
-        return keypoint_record(data[:, :, kept], camera, keypoint_set, rate, 0.0, 0, path, None, chosen)
+        return keypoint_record(data[:, :, kept], camera, keypoint_set, rate, path, names=chosen)
     keypoint_set, at = known_set(chosen, keypoint_set, path)
     whole = np.zeros((*data.shape[:2], len(KEYPOINT_SETS[keypoint_set]), 3))
     whole[:, :, at] = data[:, :, kept]
-    return keypoint_record(whole, camera, keypoint_set, rate, 0.0, 0, path, None)
+    return keypoint_record(whole, camera, keypoint_set, rate, path)
 
 
 def _of_columns(columns: Sequence[Sequence[str]], frames: NDArray, values: NDArray) -> Table:
     """Points of DeepLabCut's columns (..., [individual], part, coordinate) with values (N, C) of frames (N,)."""
     if any(len(column) not in (3, 4) for column in columns) or not columns or not len(frames):
-        raise ObservationError("columns of another form, or no rows", remedy=_AGAIN)
+        raise ObservationError("columns of another form, or no rows", remedy=_EXPORT_AGAIN)
     people = list(dict.fromkeys(column[-3] if len(column) == 4 else "" for column in columns))
     parts, axes = list(dict.fromkeys(column[-2] for column in columns)), ["x", "y", "likelihood"]
     if odd := {column[-1] for column in columns} ^ set(axes):
@@ -79,9 +80,9 @@ def _deeplabcut(path: Path) -> Table:
         heads = [row for row in rows[:4] if row and row[0] in ("scorer", "individuals", "bodyparts", "coords")]
         numbers = np.array([[float(cell or "nan") for cell in row] for row in rows[len(heads) :] if row])
     except (ValueError, csv.Error) as error:
-        raise FileError(f"a cell is not a number ({error})", remedy=_AGAIN) from error
+        raise FileError(f"a cell is not a number ({error})", remedy=_EXPORT_AGAIN) from error
     if numbers.ndim != 2 or {len(row) for row in heads} != {numbers.shape[1]} or heads[-1][0] != "coords":
-        raise FileError("rows of different lengths, or none", remedy=_AGAIN)
+        raise FileError("rows of different lengths, or none", remedy=_EXPORT_AGAIN)
     return _of_columns(list(zip(*(row[1:] for row in heads), strict=True)), numbers[:, 0], numbers[:, 1:])
 
 
@@ -130,7 +131,7 @@ def _sleap_csv(path: Path) -> Table:
     head = read_bytes(path, 2**20).partition(b"\n")[0].decode("utf-8-sig", "replace").split(",")
     names = [cell.strip().removesuffix(".x") for cell in head if cell.strip().endswith(".x")]
     columns = [f"{name}.{axis}" for name in names for axis in ("x", "y", "score")]
-    table = read_table(path, ["frame_idx"], _AGAIN, optional=columns)[1]
+    table = read_table(path, ["frame_idx"], _EXPORT_AGAIN, optional=columns)[1]
     frames = frame_numbers(table[:, 0], "frame_idx")
     order = np.argsort(frames, kind="stable")
     values = table[order, 1:].reshape(len(table), len(names), 3)
@@ -161,7 +162,7 @@ def _hdf5(path: Path) -> Iterator[Any]:
             yield file
     except (OSError, KeyError, ValueError, TypeError, RuntimeError, StopIteration, AttributeError,
             EOFError, IndexError) as error:  # fmt: skip
-        raise FileError(f"damaged, or of another form ({error})", remedy=_AGAIN) from error
+        raise FileError(f"damaged, or of another form ({error})", remedy=_EXPORT_AGAIN) from error
 
 
 def _whole(dataset: Any) -> NDArray:

@@ -41,7 +41,7 @@ from kinefit.observations import Keypoints
 from kinefit.readers.landmarks.keypoint_sets import HAND_POINTS, KEYPOINT_SETS
 from kinefit.readers.plugins import Extension, Extensions
 
-_SETS = ("COCO_17", "HALPE_26", "COCO_WHOLEBODY_133", "BODY_25", "MEDIAPIPE_33")  # told by the number of points
+_SETS = ("COCO_17", "HALPE_26", "COCO_WHOLEBODY_133", "BODY_25", "MEDIAPIPE_33")  # by their different numbers of points
 _CORRECT = "Correct the name there."
 
 _Three = tuple[float, float, float]

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from glob import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from kinefit.images.detectors.box_detector import Models
+    from kinefit.images.detectors.looking import Adder
     from kinefit.images.detectors.networks import TopDownModels
     from kinefit.readers.take.entries import CameraEntry
     from kinefit.readers.take.file import Take
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
 PEOPLE = 3
 """How many people are followed at most in one camera, by default."""
 
-_LARGE = "pose_landmark_heavy.tflite"
-QUALITIES = {"balanced": "pose_landmark_full.tflite", "auto": _LARGE, "best": _LARGE}
+_LARGE_NETWORK = "pose_landmark_heavy.tflite"
+QUALITIES = {"balanced": "pose_landmark_full.tflite", "auto": _LARGE_NETWORK, "best": _LARGE_NETWORK}
 """Landmark networks: the larger, the nearer to the joints, and the slower. "auto" does not look at every image."""
 
 QUALITY = "best"
@@ -303,7 +304,6 @@ def _look_through(
     from kinefit.readers.videos.video import Video
 
     models, folder = files.models(threads), files.folder
-    hands = settings.hands and models.layout.keypoint_set in WITH_HANDS
     with Video(job.video, rate=job.rate) as video:
         first, last = seconds_of(job, video)
 
@@ -313,12 +313,14 @@ def _look_through(
                 yield image
             tell(job.camera, last - first, last - first)
 
+        adders: dict[Literal["hands", "face"], Adder] = {}
+        if settings.hands and models.layout.keypoint_set in WITH_HANDS:
+            adders["hands"] = HandFollower(HandModels(folder, threads), layout=models.layout)
+        if settings.face:
+            adders["face"] = FaceFinder(FaceModels(folder, threads), models.layout)
         found = detect_people(
             counted(video.frames(first, last)), models, camera=job.camera, rate=video.rate,
-            people=settings.people or 0, masks=bool(settings.masks),
-            with_hands=HandFollower(HandModels(folder, threads), layout=models.layout) if hands else None,
-            with_faces=FaceFinder(FaceModels(folder, threads), models.layout) if settings.face else None,
-            looks=job.looks,
+            people=settings.people or 0, masks=bool(settings.masks), adders=adders, looks=job.looks,
         )  # fmt: skip
         times = video.times if video.unevenness else None
         found = replace(found.within(first, len(video)), times=times, source=str(job.video))
