@@ -22,10 +22,17 @@ from numpy.typing import NDArray
 from kinefit.bodies.motion import Motion
 from kinefit.errors import ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
-from kinefit.images.photogrammetry.intersection import Intersections, intersect
+from kinefit.images.photogrammetry.intersection import (
+    BODY_SIGMA,
+    Intersections,
+    Ranges,
+    at_range,
+    body_ranges,
+    intersect,
+    plane_ranges,
+)
 from kinefit.images.photogrammetry.least_squares_matching import MIN_CORRELATION, WINDOW, Grid, Matches, Seeds, match
 from kinefit.images.photogrammetry.matching.multi_image import Correlations, search_box
-from kinefit.images.photogrammetry.points.one_camera import BODY_SIGMA, Ranges, at_range, body_ranges, plane_ranges
 from kinefit.images.photogrammetry.returning import PointReturn, Vanished
 from kinefit.images.photogrammetry.spline_image import SplineImage
 from kinefit.images.photogrammetry.surface import check_images, max_parallax, measure

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from kinefit.images.detectors.box_detector import Models
-    from kinefit.images.detectors.looking import Adder
+    from kinefit.images.detectors.detection import Adder
     from kinefit.images.detectors.networks import TopDownModels
     from kinefit.readers.take.entries import CameraEntry
     from kinefit.readers.take.file import Take
@@ -280,7 +280,7 @@ def _looks(jobs: Sequence[DetectionJob]) -> dict[DetectionJob, range]:
 
     Empty, so that all are looked at, where the cameras do not take their images together, or that is not known.
     """
-    from kinefit.images.detectors.looking import LOOK_RATE
+    from kinefit.images.detectors.detection import LOOK_RATE
     from kinefit.readers.videos.video import Video
 
     rates, firsts = [], []
