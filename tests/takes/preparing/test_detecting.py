@@ -23,7 +23,7 @@ def look(images, models, *, camera, rate, people, masks, adders, looks):
 @pytest.fixture
 def found(write_frames, tmp_path, monkeypatch):
     monkeypatch.setattr("kinefit.images.detectors.box_detector.Models", lambda *given, **more: None)
-    monkeypatch.setattr("kinefit.images.detectors.detection.detect_people", look)
+    monkeypatch.setattr("kinefit.takes.preparing.detecting.detect_people", look)
 
     def run(steps, seconds=None):
         video = write_frames(tmp_path / "a.mp4", steps, size=(64, 48))

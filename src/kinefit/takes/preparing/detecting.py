@@ -11,25 +11,27 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from glob import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from kinefit._files import regular
+from kinefit._files import regular, writing
 from kinefit._threads import cores
 from kinefit.errors import AssetError, FileError, TakeError
+from kinefit.images.detectors import box_detector
+from kinefit.images.detectors.detection import LOOK_RATE, Adder, detect_people
+from kinefit.images.detectors.faces import FaceFinder, FaceModels, HandFollower, HandModels
+from kinefit.images.detectors.networks import TopDownModels
 from kinefit.observations.detections import WITH_HANDS
+from kinefit.readers.assets import MODELS_CREDIT, MODELS_PACKAGE, detector_models, landmark_models
+from kinefit.readers.landmarks.detections import detections_file, detections_key
+from kinefit.readers.landmarks.networks import description_file, is_blazepose, open_people, open_points
+from kinefit.readers.take.cameras import is_uncalibrated
+from kinefit.readers.take.entries import CameraEntry
+from kinefit.readers.take.file import Take
+from kinefit.readers.videos.video import Video
 from kinefit.takes.preparing.each_video import Step, Tell, each_video, video_key
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from kinefit.images.detectors.box_detector import Models
-    from kinefit.images.detectors.detection import Adder
-    from kinefit.images.detectors.networks import TopDownModels
-    from kinefit.readers.take.entries import CameraEntry
-    from kinefit.readers.take.file import Take
-    from kinefit.readers.videos.video import Video
 
 PEOPLE = 3
 """How many people are followed at most in one camera, by default."""
@@ -127,7 +129,7 @@ class Networks:
         """Whether the landmarks are those of a file of one's own, whatever its kind."""
         return self.name not in QUALITIES
 
-    def models(self, threads: int = 1) -> Models | TopDownModels:
+    def models(self, threads: int = 1) -> box_detector.Models | TopDownModels:
         """The networks, loaded; not to be shared between threads.
 
         Raises
@@ -137,9 +139,6 @@ class Networks:
         FileError, PluginError
             A network that cannot be used.
         """
-        from kinefit.images.detectors import box_detector, networks
-        from kinefit.readers.landmarks.networks import is_blazepose, open_people, open_points
-
         if self.is_own and not is_blazepose(self.landmarks):
             points, layout = open_points(self.landmarks, threads)
             people: Any
@@ -148,16 +147,13 @@ class Networks:
             else:
                 file = self.folder / box_detector.DETECTOR
                 people = box_detector.PersonDetector(box_detector.interpreter(file, threads))
-            return networks.TopDownModels(points, layout, people, mirrored=self.mirrored)
+            return TopDownModels(points, layout, people, mirrored=self.mirrored)
         more = {"people": open_people(self.detector, threads)} if self.detector else {}
         return box_detector.Models(self.folder, threads, self.landmarks, mirrored=self.mirrored, **more)
 
 
 def jobs_of_take(take: Take) -> list[DetectionJob]:
     """Every camera of a take that has a video; TakeError where none has."""
-    from kinefit.readers.landmarks.detections import detections_file
-    from kinefit.readers.take.cameras import is_uncalibrated
-
     rate, clocks_unknown = _rate(take) if take.frames else 0.0, is_uncalibrated(take)
     found = [
         DetectionJob(
@@ -174,8 +170,6 @@ def jobs_of_take(take: Take) -> list[DetectionJob]:
 
 def _rate(take: Take) -> float:
     """Rate [Hz] of a take's steps: its own, or the highest of its videos'."""
-    from kinefit.readers.videos.video import Video
-
     rates = [take.rate or 0.0]
     for camera in take.cameras if take.rate is None else ():
         if camera.video is not None:
@@ -200,8 +194,6 @@ def detect(
 
     Every file is written as soon as its video is done, so that what was interrupted goes on with the others.
     """
-    from kinefit.readers.landmarks.detections import detections_key
-
     keys = {job: detection_key(job) for job in jobs}
     if settings.quality is None:  # what is done anew is done as before
         stored = (detections_key(job.file, "network") for job in jobs)
@@ -245,8 +237,6 @@ def detect(
 
 def _alone(settings: DetectionSettings, before: Path | None) -> Networks | None:
     """Networks of one's own with which no built-in one is used, nor fetched; None for others."""
-    from kinefit.readers.landmarks.networks import is_blazepose
-
     own = settings.quality or before
     if not settings.detector or settings.hands or settings.face or not isinstance(own, Path) or is_blazepose(own):
         return None
@@ -255,9 +245,6 @@ def _alone(settings: DetectionSettings, before: Path | None) -> Networks | None:
 
 def _from_beside(job: DetectionJob, key: str, wanted: Mapping[str, object]) -> None:
     """Copy what another take of the same folder found in the same video already."""
-    from kinefit._files import writing
-    from kinefit.readers.landmarks.detections import detections_key
-
     if _fits(detections_key(job.file), key, wanted, job.seconds):
         return
     for other in sorted(job.file.parent.parent.glob(f"*-detect/{escape(job.file.name)}")):
@@ -280,9 +267,6 @@ def _looks(jobs: Sequence[DetectionJob]) -> dict[DetectionJob, range]:
 
     Empty, so that all are looked at, where the cameras do not take their images together, or that is not known.
     """
-    from kinefit.images.detectors.detection import LOOK_RATE
-    from kinefit.readers.videos.video import Video
-
     rates, firsts = [], []
     for job in jobs:
         with Video(job.video, rate=job.rate) as video:
@@ -298,10 +282,8 @@ def _looks(jobs: Sequence[DetectionJob]) -> dict[DetectionJob, range]:
 def _look_through(
     job: DetectionJob, files: Networks, settings: DetectionSettings, key: str, tell: Step, threads: int
 ) -> None:
-    from kinefit.exporters.motion_file import write_detections
-    from kinefit.images.detectors.detection import detect_people
-    from kinefit.images.detectors.faces import FaceFinder, FaceModels, HandFollower, HandModels
-    from kinefit.readers.videos.video import Video
+
+    from kinefit.exporters.motion_file import write_detections  # all exporters, which take their time to import
 
     models, folder = files.models(threads), files.folder
     with Video(job.video, rate=job.rate) as video:
@@ -335,10 +317,7 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
     Where the large one cannot be fetched, that of "balanced", which comes with the one that finds people, stands in for
     it, and says so.
     """
-    from kinefit.images.detectors.box_detector import LANDMARKS, check_runtime
-    from kinefit.readers.assets import MODELS_CREDIT, detector_models, landmark_models
-
-    check_runtime()
+    box_detector.check_runtime()
     fetched: list[int] = []
 
     def report(done: int, total: int) -> None:
@@ -351,19 +330,17 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
     folder = detector_models(report)
     if isinstance(quality, Path):
         return Networks(folder, quality, _name_of(quality))
-    if QUALITIES[quality] == LANDMARKS:
-        return Networks(folder, folder / LANDMARKS, quality)
+    if QUALITIES[quality] == box_detector.LANDMARKS:
+        return Networks(folder, folder / box_detector.LANDMARKS, quality)
     try:
         return Networks(folder, landmark_models(report) / QUALITIES[quality], quality)
     except AssetError as error:
         tell(f"{error} Until then, the network of quality 'balanced' is used.")
-        return Networks(folder, folder / LANDMARKS, "balanced")
+        return Networks(folder, folder / box_detector.LANDMARKS, "balanced")
 
 
 def _name_of(quality: str | Path) -> str:
     """Name that distinguishes results by quality, or by the network's file and the one that describes it."""
-    from kinefit.readers.landmarks.networks import description_file
-
     if isinstance(quality, str):
         return quality
     try:
@@ -378,8 +355,6 @@ def _name_of(quality: str | Path) -> str:
 
 def detection_key(job: DetectionJob) -> str:
     """Begin of the key of a video's detections: text that another video, or another detector, does not have."""
-    from kinefit.readers.assets import MODELS_PACKAGE
-
     return video_key(job.video, job.rate, f"{MODELS_PACKAGE} {_METHOD}")
 
 
