@@ -53,7 +53,7 @@ clients._run([clients.program("npm") or "true", "--version"], Path("partial/tmp"
     "a MATLAB file": """
 from pathlib import Path
 from kinefit.errors import KinefitError
-from kinefit.readers.calibration.matlab import read_mat
+from kinefit.readers.calibration.programs import read_mat
 Path("a.mat").write_bytes(b"none")
 try:
     read_mat(Path("a.mat"))

@@ -14,10 +14,9 @@ from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import MarkerSet, find_marker_set
 from kinefit.errors import ObservationError
 from kinefit.findings import runs_of
-from kinefit.markers.audit.gaps import find_swaps_in_gaps
 from kinefit.markers.audit.plausible import moved_labels, permanent_swaps, places_of_model, places_of_set
 from kinefit.markers.audit.resting import resting_markers
-from kinefit.markers.audit.swaps import MAX_GAP, best_run, find_crossings, pair_gain, short_swaps, swap_gains
+from kinefit.markers.audit.swaps import MAX_GAP, best_run, find_crossings, gap_swaps, pair_gain, short_swaps, swap_gains
 from kinefit.markers.model.learn import learn_model
 from kinefit.markers.model.model import MarkerModel
 from kinefit.markers.take.consistency import Consistency
@@ -193,7 +192,7 @@ def _find_swaps(positions: NDArray, model: MarkerModel, labels: Sequence[str]) -
     step = max(1, -(-len(positions) // MAX_SWAP_FRAMES))
     found: list[AuditFinding] = []
     broken = find_crossings(positions, MIN_JUMP)[1]
-    for find in (short_swaps, partial(find_swaps_in_gaps, mean=mean, deviation=deviation)):
+    for find in (short_swaps, partial(gap_swaps, mean=mean, deviation=deviation)):
         for a, b, first, last in find(positions, least=MIN_JUMP):
             span = slice(first, last + 1)
             better = pair_gain(positions[span], a, b, mean, deviation).sum() > 0
