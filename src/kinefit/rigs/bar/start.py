@@ -32,12 +32,11 @@ _MIN_PARALLAX = np.radians(2.0)  # between rays: with less distances are undeter
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two cameras that agree: indices in the rig, cameras with focal length and pose, agreeing share, score."""
+    """Two cameras that agree: indices in the rig, cameras with focal length and pose, score."""
 
     first: int
     second: int
     cameras: tuple[Camera, Camera]
-    agree: float
     worth: float
 
 
@@ -104,7 +103,7 @@ def first_pairs(cameras: Sequence[Camera], uv: NDArray, known: bool, length: flo
             reasons[f"all places that {name} share lie in one plane, or both cameras are nearly in one place"] = 1.0
             continue
         for metric, gain in _metric((cameras[i], cameras[j]), F, a[inside], b[inside], known, length):
-            pairs.append(Pair(i, j, metric, share, gain * share))
+            pairs.append(Pair(i, j, metric, gain * share))
     if not pairs:
         worst = max(reasons, key=reasons.__getitem__, default="no two cameras see it from different sides")
         flatness = "plane" in worst
