@@ -22,7 +22,7 @@ from kinefit.readers.landmarks.detections import detections_file, read_detection
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.takes.preparing import detecting, each_video
+from kinefit.takes.preparing import detecting
 from kinefit.takes.preparing.take import ensure_detections, with_detections
 from kinefit.takes.track import track_take
 
@@ -147,7 +147,7 @@ def test_another_video_or_setting_is_done_anew_and_only_that(take, networks):
 
 
 def test_what_was_interrupted_goes_on_with_the_others(take, networks, monkeypatch):
-    monkeypatch.setattr(each_video, "cores", lambda: 1)
+    monkeypatch.setattr(detecting, "cores", lambda: 1)
 
     def stop(camera, done, total):
         if camera == "cam02" and done == 6:
@@ -165,8 +165,8 @@ def test_ctrl_c_says_how_much_is_kept(take, monkeypatch):
         futures[0].result()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(each_video, "cores", lambda: 1)
-    monkeypatch.setattr(each_video, "wait", interrupted)
+    monkeypatch.setattr(detecting, "cores", lambda: 1)
+    monkeypatch.setattr(detecting, "wait", interrupted)
     with pytest.raises(KeyboardInterrupt, match=r"[1-4] of 4 videos are done"):
         ensure_detections(read_take(take))
     assert detections_file(take, "cam01").is_file()

@@ -213,14 +213,14 @@ def _coarse_starts(
         kernels.match_points(*pair, at * scale, start, halves, MAX_STEPS, 0.01, share, one.noise**2, out)
         good = (out[:, kernels.STATUS] == kernels.FOUND) & (out[:, kernels.CORRELATION] >= _MIN_LEVEL_CORRELATION)
         if good.any():
-            near = np.flatnonzero(good)[_nearest(at, at[good])]
+            near = np.flatnonzero(good)[nearest(at, at[good])]
             maps = out[near, 2:6].reshape(-1, 2, 2)
             begin[:, 2:] = out[near, 2:6]
             begin[:, :2] = out[near, :2] / scale + np.einsum("nij,nj->ni", maps, at - at[near])
     return begin
 
 
-def _nearest(at: NDArray, others: NDArray) -> NDArray[np.int64]:
+def nearest(at: NDArray, others: NDArray) -> NDArray[np.int64]:
     """(N,) index of the nearest of `others` (M, 2) to each point (N, 2)."""
     out = np.empty(len(at), np.int64)
     for k in range(0, len(at), 1000):  # rows of a table of distances

@@ -5,7 +5,7 @@ Track one person with a rig, and prepare the measurements for a bundle adjustmen
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from kinefit.bodies.motion import Motion
 from kinefit.fitting.multiview.association import choose_people, person_records
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.subject.parameters import PointOffsets
-from kinefit.fitting.subject.subject import Subject
+from kinefit.fitting.subject.subject import Progress, Subject
 from kinefit.fitting.tracking.recording import Recording, spread
 from kinefit.fitting.tracking.video import track
 from kinefit.geometry.camera import Rig
@@ -26,8 +26,6 @@ from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solving.bundle.adjust import Bundle, BundleState, adjust
 from kinefit.solving.bundle.cameras import COLUMNS, FOCAL, TIME, PointPixels, camera_jacobian, departure
 from kinefit.solving.bundle.shape import PROPORTIONS, BodyProblem, PixelFrames, ShapeParameters, shape_parameters
-
-Progress = Callable[[str, int, int], None]
 
 _MIN_INLIER_WEIGHT = 0.25  # of the robust loss (Geman-McClure: within its scale)
 _POINT_SIGMA = 0.01  # [m] default of a detector's points about the body's

@@ -26,8 +26,8 @@ from kinefit.readers.landmarks.detections import detections_key, read_detections
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.videos.video import Video
-from kinefit.takes.preparing.detecting import DetectionJob, detection_key, hushed, jobs_of_take, networks, seconds_of
-from kinefit.takes.preparing.each_video import Step, Tell, each_video, video_key
+from kinefit.takes.preparing import detecting
+from kinefit.takes.preparing.detecting import DetectionJob, Step, Tell, jobs_of_take, networks, seconds_of
 from kinefit.takes.preparing.take import with_detections
 
 _METHOD = "faces 1"  # raise it when other circles are found in the same video
@@ -162,15 +162,15 @@ def ensure_faces(
         def work(job: DetectionJob, step: Step) -> None:
             _write(find_faces(job, threads=threads, folder=folder, step=step), _file(job), jobs[job])
 
-        with hushed():
+        with detecting.hushed():
             FaceDetector(folder)
-        each_video(todo, work, progress, of=len(jobs))
+        detecting.each_video(todo, work, progress, of=len(jobs))
     found = {job.camera: _read(_file(job), key) for job, key in jobs.items()}
     return {camera: heads for camera, heads in found.items() if heads is not None}
 
 
 def _seconds_key(job: DetectionJob, method: str) -> str:
-    return video_key(job.video, job.rate, f"{method} {job.seconds or ''}")
+    return detecting.video_key(job.video, job.rate, f"{method} {job.seconds or ''}")
 
 
 def _file(job: DetectionJob) -> Path:
@@ -261,7 +261,7 @@ def hide_in_copies(path: Path, progress: Step | None, tell: Tell) -> list[Path]:
         with HiddenVideo(job.video, heads[job.camera], rate=job.rate, more=of_people) as video:
             write_pictures(shown(video), copies[job.camera], video.rate, video.size, times=video.times)
         if found is not None and key is not None:
-            own, of_copy = detection_key(job), detection_key(replace(job, video=copies[job.camera]))
+            own, of_copy = detecting.detection_key(job), detecting.detection_key(replace(job, video=copies[job.camera]))
             write_detections(found, job.file, key=key.replace(own, of_copy, 1))
     names = iter([f"{FOLDER}/{copies[camera.name].name}" for camera in take.cameras if camera.video is not None])
     write_text(path, _VIDEO.sub(lambda line: f'video = "{next(names)}"', path.read_text("utf-8")))

@@ -16,8 +16,7 @@ from kinefit.readers.landmarks.keypoint_sets import FACE_SET
 from kinefit.readers.take.entries import KeypointsEntry
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.kinds import kinds_of
-from kinefit.takes.preparing.detecting import DetectionJob, DetectionSettings, detect, jobs_of_take
-from kinefit.takes.preparing.each_video import Step, Tell
+from kinefit.takes.preparing.detecting import DetectionJob, DetectionSettings, Step, Tell, detect, jobs_of_take
 
 
 def warn(text: str) -> None:
