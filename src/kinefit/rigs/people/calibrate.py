@@ -21,6 +21,7 @@ from kinefit.bodies.motion import rotation_between_up
 from kinefit.errors import CalibrationError
 from kinefit.fitting.multiview.association import person_records
 from kinefit.fitting.smoothing.foot_contacts import fit_plane, upward
+from kinefit.fitting.subject.subject import Progress
 from kinefit.fitting.tracking.recording import spread
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
@@ -29,7 +30,7 @@ from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.rigs.people.skeletons import first_cameras, in_step, steady_person
 from kinefit.rigs.refine.gauge import resized
 from kinefit.rigs.refine.refine import Length, check_input, length_of, prior_sigma, refine_from
-from kinefit.rigs.refine.result import PersonSighting, PersonTrial, Progress, Refinement
+from kinefit.rigs.refine.result import PersonSighting, PersonTrial, Refinement
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solving.bundle.adjust import BundleState, adjust
 from kinefit.solving.bundle.cameras import FOCAL, TIME, CameraPrior, PointPixels

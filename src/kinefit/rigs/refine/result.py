@@ -16,7 +16,7 @@ from kinefit.bodies.motion import Motion
 from kinefit.fitting.multiview.association import choose_people, person_records
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.subject.parameters import PointOffsets
-from kinefit.fitting.subject.subject import Progress, Subject
+from kinefit.fitting.subject.subject import Subject
 from kinefit.fitting.tracking.recording import Recording, spread
 from kinefit.fitting.tracking.video import track
 from kinefit.geometry.camera import Rig
