@@ -238,13 +238,11 @@ def _alike(a: tuple[Camera, Camera], b: tuple[Camera, Camera]) -> bool:
 
 def _posed(E: NDArray, a: NDArray, b: NDArray) -> tuple[NDArray, NDArray, float, float] | None:
     """T_b_a with |t| = 1, lengths of the bar (M,), median angle of the rays, share in front: the best of four poses."""
-    u, _, vt = np.linalg.svd(E)
-    W = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    R_a, R_b, way = cv2.decomposeEssentialMat(E)
     rays = [np.concatenate([p.reshape(-1, 2), np.ones((p.size // 2, 1))], axis=1) for p in (a, b)]
     best = None
-    for R in (u @ W @ vt, u @ W.T @ vt):
-        R = R * np.sign(np.linalg.det(R))
-        for t in (u[:, 2], -u[:, 2]):
+    for R in (R_a, R_b):
+        for t in (way.ravel(), -way.ravel()):
             # nearest points of the rays s p from the first camera and r Rᵀ q from the second at -Rᵀ t
             p, q, centre = rays[0], rays[1] @ R, -R.T @ t
             pp, qq, pq = (np.sum(x * y, axis=1) for x, y in ((p, p), (q, q), (p, q)))
