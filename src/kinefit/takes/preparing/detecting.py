@@ -410,7 +410,7 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
     Where the large one cannot be fetched, that of "balanced", which comes with the one that finds people, stands in for
     it, and says so.
     """
-    box_detector.check_runtime()
+    box_detector.litert_interpreter()
     fetched: list[int] = []
 
     def report(done: int, total: int) -> None:
