@@ -126,12 +126,9 @@ def targets_in(grey: NDArray, still: NDArray | None = None) -> NDArray:
 
 def _centroid(weight: NDArray) -> tuple[NDArray, float]:
     """Centroid (u, v) of weights (H, W), and their aspect ratio (length over width)."""
-    v, u = np.mgrid[: weight.shape[0], : weight.shape[1]]
-    total = float(weight.sum())
-    centre = np.array([np.sum(u * weight), np.sum(v * weight)]) / total
-    du, dv = u - centre[0], v - centre[1]
-    spread = np.array([[np.sum(weight * du * du), np.sum(weight * du * dv)], [0.0, np.sum(weight * dv * dv)]]) / total
-    spread[1, 0] = spread[0, 1]
+    m = cv2.moments(weight)
+    centre = np.array([m["m10"], m["m01"]]) / m["m00"]
+    spread = np.array([[m["mu20"], m["mu11"]], [m["mu11"], m["mu02"]]]) / m["m00"]
     small, large = np.linalg.eigvalsh(spread + np.eye(2) / 12.0)  # 1/12: variance of one pixel
     return centre, float(np.sqrt(large / small))
 
