@@ -53,7 +53,7 @@ clients._run([clients.program("npm") or "true", "--version"], Path("partial/tmp"
     "a MATLAB file": """
 from pathlib import Path
 from kinefit.errors import KinefitError
-from kinefit.readers.calibration.matlab import read_mat
+from kinefit.readers.calibration.programs import read_mat
 Path("a.mat").write_bytes(b"none")
 try:
     read_mat(Path("a.mat"))
@@ -89,7 +89,7 @@ ENDINGS = {
     "kinefit.readers.markers:read_markers": ("a.c3d", "a.trc"),
     "kinefit.readers.skeletons.bvh:read_bvh": ("a.bvh",),
     "kinefit.readers.skeletons.acclaim:read_asf": ("a.asf",),
-    "kinefit.readers.skeletons.gltf:read_gltf": ("a.glb", "a.gltf"),
+    "kinefit.readers.skeletons.characters:read_gltf": ("a.glb", "a.gltf"),
     "kinefit.readers.skeletons.characters:read_names": ("a.toml", "a.csv"),
     "kinefit.readers.calibration.read:read_calibration": ("a.toml", "a.json", "a.yml", "a.xml", "a.mat", "a.xcp"),
     "kinefit.readers.take.file:read_take": ("take.toml",),

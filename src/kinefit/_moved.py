@@ -39,6 +39,8 @@ MOVED_PATHS = {
     "fitting.tracking.placing": "fitting.tracking.cameras", "fitting.tracking.session": "fitting.tracking.motions",
     "frame": "fitting.frame", "identification": "markers",
     "images.photogrammetry.flat": "images.photogrammetry.surface",
+    "images.photogrammetry.points": "images.photogrammetry",
+    "images.photogrammetry.points.one_camera": "images.photogrammetry.intersection",
     "images.photogrammetry.region_growing": "images.photogrammetry.least_squares_matching",
     "images.photogrammetry.states": "images.photogrammetry.surface", "initialization": "fitting.initialization",
     "lasting_errors": "bodies.lasting_errors", "live": "studio.live", "losses": "geometry.losses",

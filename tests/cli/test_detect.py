@@ -22,7 +22,7 @@ from kinefit.readers.landmarks.detections import detections_file, read_detection
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.takes.preparing import detecting, each_video
+from kinefit.takes.preparing import detecting
 from kinefit.takes.preparing.take import ensure_detections, with_detections
 from kinefit.takes.track import track_take
 
@@ -147,7 +147,7 @@ def test_another_video_or_setting_is_done_anew_and_only_that(take, networks):
 
 
 def test_what_was_interrupted_goes_on_with_the_others(take, networks, monkeypatch):
-    monkeypatch.setattr(each_video, "cores", lambda: 1)
+    monkeypatch.setattr(detecting, "cores", lambda: 1)
 
     def stop(camera, done, total):
         if camera == "cam02" and done == 6:
@@ -165,8 +165,8 @@ def test_ctrl_c_says_how_much_is_kept(take, monkeypatch):
         futures[0].result()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(each_video, "cores", lambda: 1)
-    monkeypatch.setattr(each_video, "wait", interrupted)
+    monkeypatch.setattr(detecting, "cores", lambda: 1)
+    monkeypatch.setattr(detecting, "wait", interrupted)
     with pytest.raises(KeyboardInterrupt, match=r"[1-4] of 4 videos are done"):
         ensure_detections(read_take(take))
     assert detections_file(take, "cam01").is_file()
@@ -262,7 +262,7 @@ def test_the_missing_extra_is_told_before_anything_is_fetched(monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "ai_edge_litert.interpreter", None)
-    monkeypatch.setattr("kinefit.readers.assets.detector_models", lambda progress: pytest.fail("fetched"))
+    monkeypatch.setattr("kinefit.takes.preparing.detecting.detector_models", lambda progress: pytest.fail("fetched"))
     with pytest.raises(ObservationError, match=r"pip install 'kinefit\[detect\]'"):
         detecting.networks(None, pytest.fail)
 
@@ -276,12 +276,12 @@ def test_the_licence_is_shown_when_the_networks_are_fetched(monkeypatch, tmp_pat
         progress(36_000_000, 36_000_000)
         return tmp_path
 
-    monkeypatch.setattr("kinefit.readers.assets.detector_models", fetch)
+    monkeypatch.setattr("kinefit.takes.preparing.detecting.detector_models", fetch)
     steps, said = [], []
     assert detecting.networks(lambda *step: steps.append(step), said.append).folder == tmp_path
     assert len(said) == 1 and "Apache-2.0" in said[0] and "MediaPipe" in said[0]
     assert steps == [("download MB", 0, 36), ("download MB", 36, 36)]
-    monkeypatch.setattr("kinefit.readers.assets.detector_models", lambda progress: tmp_path)
+    monkeypatch.setattr("kinefit.takes.preparing.detecting.detector_models", lambda progress: tmp_path)
     detecting.networks(None, pytest.fail)  # nothing is said when they are there already
 
 
@@ -289,8 +289,8 @@ def test_the_licence_is_shown_when_the_networks_are_fetched(monkeypatch, tmp_pat
 def test_a_quality_is_a_landmark_network(monkeypatch, tmp_path, quality, file):
     monkeypatch.undo()
     pytest.importorskip("ai_edge_litert")
-    monkeypatch.setattr("kinefit.readers.assets.detector_models", lambda progress: tmp_path / "pip")
-    monkeypatch.setattr("kinefit.readers.assets.landmark_models", lambda progress: tmp_path / "npm")
+    monkeypatch.setattr("kinefit.takes.preparing.detecting.detector_models", lambda progress: tmp_path / "pip")
+    monkeypatch.setattr("kinefit.takes.preparing.detecting.landmark_models", lambda progress: tmp_path / "npm")
     found = detecting.networks(None, pytest.fail, quality)
     assert (found.folder, found.landmarks.name, found.name) == (
         tmp_path / "pip", f"pose_landmark_{file}.tflite", quality
@@ -305,8 +305,8 @@ def test_where_the_large_network_cannot_be_had_the_other_stands_in_and_says_so(m
     def offline(progress):
         raise AssetError("npm could not fetch @mediapipe/pose", remedy="Check the network.")
 
-    monkeypatch.setattr("kinefit.readers.assets.detector_models", lambda progress: tmp_path)
-    monkeypatch.setattr("kinefit.readers.assets.landmark_models", offline)
+    monkeypatch.setattr("kinefit.takes.preparing.detecting.detector_models", lambda progress: tmp_path)
+    monkeypatch.setattr("kinefit.takes.preparing.detecting.landmark_models", offline)
     said = []
     found = detecting.networks(None, said.append, "best")
     assert found.name == "balanced" and found.landmarks == tmp_path / "pose_landmark_full.tflite"
@@ -347,7 +347,7 @@ def test_hands_are_looked_for_where_they_are_asked_for_and_kept(take, networks, 
         def landmarks(self, image, roi):
             return SimpleNamespace(presence=0.1)
 
-    monkeypatch.setattr("kinefit.images.detectors.faces.HandModels", NoHands)
+    monkeypatch.setattr("kinefit.takes.preparing.detecting.HandModels", NoHands)
     file = detections_file(take, "cam01")
     assert run(take).exit_code == 0 and read_detections(file).hands is None
     first = networks.pictures
@@ -368,7 +368,7 @@ def test_faces_are_looked_for_where_they_are_asked_for_and_kept(take, networks, 
         def landmarks(self, image, roi):
             return SimpleNamespace(presence=0.1)
 
-    monkeypatch.setattr("kinefit.images.detectors.faces.FaceModels", NoFaces)
+    monkeypatch.setattr("kinefit.takes.preparing.detecting.FaceModels", NoFaces)
     file = detections_file(take, "cam01")
     assert run(take).exit_code == 0 and read_detections(file).face is None
     told = run(take, "--face")

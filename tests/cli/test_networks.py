@@ -84,7 +84,7 @@ def off(take, camera):
 
 
 def test_a_take_is_detected_and_tracked_by_a_network_of_its_own(take, tmp_path, monkeypatch):
-    monkeypatch.setattr("kinefit.readers.assets.detector_models", lambda progress: pytest.fail("fetched"))
+    monkeypatch.setattr("kinefit.takes.preparing.detecting.detector_models", lambda progress: pytest.fail("fetched"))
     network = simcc_network(take.with_name("own.onnx"))
     given = "--network", network, "--detector", take.with_name("people.onnx"), "--people", 1
     told = run(take, *given)

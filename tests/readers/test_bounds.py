@@ -20,8 +20,7 @@ from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.landmarks.annotations import Clicks, read_clicks
 from kinefit.readers.ros import recordings
 from kinefit.readers.ros.images import shown
-from kinefit.readers.skeletons.characters import _order, read_character
-from kinefit.readers.skeletons.gltf import read_gltf
+from kinefit.readers.skeletons.characters import _order, read_character, read_gltf
 from kinefit.readers.videos.video import Video
 
 

@@ -69,5 +69,5 @@ def _detect(networks: detecting.Networks, path: Path) -> Detections:
         images = list(video.frames(0, amount(_FRAMES, 6)))
         models, finder = Models(networks.folder, 1, networks.landmarks), _TimedFinder(FaceModels(networks.folder))
         return detect_people(
-            images, models, camera=path.stem, rate=video.rate, people=1, masks=False, with_faces=finder
+            images, models, camera=path.stem, rate=video.rate, people=1, masks=False, adders={"face": finder}
         )  # fmt: skip

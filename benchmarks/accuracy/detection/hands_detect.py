@@ -54,7 +54,7 @@ def _detect(networks: Path, path: Path) -> tuple[NDArray, NDArray, float]:
         models, follower = Models(networks), HandFollower(HandModels(networks))
         began = time.process_time()
         found = detect_people(
-            images, models, camera=path.stem, rate=video.rate, people=0, masks=False, with_hands=follower
+            images, models, camera=path.stem, rate=video.rate, people=0, masks=False, adders={"hands": follower}
         )
         spent = time.process_time() - began
     assert found.hands is not None and found.hand_confidence is not None

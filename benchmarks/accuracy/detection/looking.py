@@ -22,7 +22,7 @@ from benchmarks.figures import NotMeasured, amount, each, figure, quick, recordi
 from benchmarks.scenes.motions import library
 from benchmarks.scenes.simulated import somebody
 from kinefit import Keypoints, Motion, Recording, load_body, track
-from kinefit.images.detectors.looking import LOOK_RATE
+from kinefit.images.detectors.detection import LOOK_RATE
 from kinefit.observations import Detections
 from kinefit.readers.assets import CAMERAS
 from kinefit.readers.landmarks.detections import read_detections

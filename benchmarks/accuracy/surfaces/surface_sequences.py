@@ -38,8 +38,8 @@ from benchmarks.commands import printed
 from benchmarks.figures import amount, data, figure
 from benchmarks.scenes.textured import write_video
 from kinefit.geometry.camera import Rig
+from kinefit.images.photogrammetry.bright_points import find_spots
 from kinefit.images.photogrammetry.least_squares_matching import Grid, match
-from kinefit.images.photogrammetry.points.bright_points import find_spots
 from kinefit.images.photogrammetry.spline_image import SplineImage
 from kinefit.images.photogrammetry.surface import measure, rigid_motion
 from kinefit.readers.calibration.read import read_calibration, write_calibration

@@ -19,7 +19,6 @@ import click
 from kinefit import __version__
 from kinefit._processes import environment
 from kinefit.cli import _screen
-from kinefit.cli._screen import CommandGroup
 from kinefit.errors import KinefitError
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: its threads only wait for each other here
@@ -59,7 +58,7 @@ _WORDS = "kinefit.words"
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
-class _Commands(CommandGroup):
+class _Commands(_screen.CommandGroup):
     """Commands that are imported when they are called; errors become messages and exit codes."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:

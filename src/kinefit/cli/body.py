@@ -8,11 +8,10 @@ from pathlib import Path
 import click
 
 from kinefit.cli import _screen
-from kinefit.cli._screen import CommandGroup
 from kinefit.errors import FileError
 
 
-@click.group(cls=CommandGroup, short_help="List, copy and render bodies; check closed chains.",
+@click.group(cls=_screen.CommandGroup, short_help="List, copy and render bodies; check closed chains.",
              invoke_without_command=True, epilog="""\b
 Examples:
   kinefit body                                   list the bodies: people, and people with gear

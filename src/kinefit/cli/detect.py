@@ -8,6 +8,9 @@ from pathlib import Path
 import click
 
 from kinefit.cli import _screen
+from kinefit.readers.landmarks.detections import read_detections
+from kinefit.readers.take.entries import KeypointsEntry
+from kinefit.readers.take.file import read_take
 from kinefit.takes.preparing import detecting
 from kinefit.takes.preparing.take import somebody
 
@@ -85,8 +88,6 @@ def detect(
 
 
 def _calibrate(take: Path, files: dict[str, Path], network: Path) -> None:
-    from kinefit.readers.take.entries import KeypointsEntry
-    from kinefit.readers.take.file import read_take
     from kinefit.takes.preparing.network_errors import calibrate_network
 
     entries = tuple(KeypointsEntry(camera=camera, file=file, format="detect") for camera, file in files.items())
@@ -101,8 +102,6 @@ def _is_take(path: Path) -> bool:
 
 
 def _jobs(inputs: tuple[Path, ...], out: Path | None) -> list[detecting.DetectionJob]:
-    from kinefit.readers.take.file import read_take
-
     takes = [path for path in inputs if _is_take(path)]
     if takes:
         if len(inputs) > 1 or out is not None:
@@ -119,8 +118,6 @@ def _jobs(inputs: tuple[Path, ...], out: Path | None) -> list[detecting.Detectio
 
 def _show(jobs: list[detecting.DetectionJob], done: list[detecting.DetectionJob]) -> None:
     """One line for each video."""
-    from kinefit.readers.landmarks.detections import read_detections
-
     for job in jobs:
         found = read_detections(job.file)
         seen = found.seen.sum(axis=0)

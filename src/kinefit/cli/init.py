@@ -71,7 +71,7 @@ def init(
     write_text(out, guess.text)
     show(guess.notes)
     if hide_faces:
-        from kinefit.takes.preparing.take import hide_in_copies
+        from kinefit.takes.preparing.faces import hide_in_copies
 
         with _screen.bars() as progress:
             copies = hide_in_copies(out, progress, _screen.note)

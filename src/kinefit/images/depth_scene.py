@@ -157,6 +157,9 @@ def clusters(x: NDArray, gap: float = _MAX_GAP) -> NDArray:
     Cubes of edge `gap` [m] that touch by a face, an edge or a corner belong to one cluster. So points closer than `gap`
     share a cluster, and points farther apart than 2√3·`gap` share one only through points between them.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     if not len(x):
         return np.zeros(0, int)
     cell = np.floor((x - x.min(axis=0)) / gap).astype(np.int64) + 1
@@ -170,15 +173,8 @@ def clusters(x: NDArray, gap: float = _MAX_GAP) -> NDArray:
         here = np.flatnonzero(cells[place] == cells + offset)
         ends.append(np.stack([here, place[here]]))
     a, b = np.concatenate(ends, axis=1)
-    label = np.arange(len(cells))
-    while True:  # every cell takes the least label of its neighbours, and of what those took
-        before = label.copy()
-        np.minimum.at(label, a, label[b])
-        np.minimum.at(label, b, label[a])
-        label = label[label]
-        if np.array_equal(label, before):
-            break
-    return np.unique(label, return_inverse=True)[1][index]
+    touching = coo_array((np.ones(len(a)), (a, b)), shape=(len(cells), len(cells)))
+    return connected_components(touching, directed=False)[1][index]
 
 
 @dataclass(frozen=True, eq=False)

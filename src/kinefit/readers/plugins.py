@@ -319,11 +319,11 @@ KEYPOINTS = FileFormats("kinefit.readers", FileFormat, "keypoint format", {
     "alphapose": "kinefit.readers.landmarks.results:ALPHAPOSE",
     "mmpose": "kinefit.readers.landmarks.results:MMPOSE",
     "mediapipe": "kinefit.readers.landmarks.keypoints:MEDIAPIPE",
-    "deeplabcut": "kinefit.readers.landmarks.named:DEEPLABCUT",
-    "sleap": "kinefit.readers.landmarks.named:SLEAP",
+    "deeplabcut": "kinefit.readers.landmarks.results:DEEPLABCUT",
+    "sleap": "kinefit.readers.landmarks.results:SLEAP",
     "freemocap": "kinefit.readers.landmarks.keypoints:FREEMOCAP",
     "caliscope": "kinefit.readers.landmarks.keypoints:CALISCOPE",
-    "sports2d": "kinefit.readers.landmarks.named:SPORTS2D",
+    "sports2d": "kinefit.readers.landmarks.results:SPORTS2D",
 }, _KINDS_OF_FILES[0])  # fmt: skip
 """Formats of keypoints, which take files name; the most informative confidence first."""
 

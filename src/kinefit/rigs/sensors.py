@@ -6,7 +6,7 @@ estimates poses, the person's surface, marker and landmark offsets, and the fram
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +20,7 @@ from kinefit.errors import ObservationError
 from kinefit.fitting.subject.fit import fit_subject
 from kinefit.fitting.subject.keypoints import fit_subject as fit_person
 from kinefit.fitting.subject.parameters import KnownLengths, Parameters, PointOffsets
-from kinefit.fitting.subject.subject import SensorFrames, Subject, SubjectFit
+from kinefit.fitting.subject.subject import Progress, SensorFrames, Subject, SubjectFit
 from kinefit.fitting.subject.surfaces import CylinderShape
 from kinefit.fitting.tracking.cameras import (
     Look,
@@ -48,8 +48,6 @@ from kinefit.sensors.surfaces.point_cloud import FINE_DISTANCES, Ends, Registrat
 
 FRAMES = 12
 """Number of fitted frames, spread over those in which the person was tracked."""
-
-Progress = Callable[[str, int, int], None]
 
 _MIN_QUALITY = 0.3  # of a frame that counts
 _MIN_FRAMES = 4  # with the person in a sensor

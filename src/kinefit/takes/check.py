@@ -25,7 +25,7 @@ from kinefit.rigs.diagnostics.quick import inverted_findings
 from kinefit.rigs.sensors import fit_sensors
 from kinefit.sensors.alignment import sensor_findings
 from kinefit.takes.missing import prepared
-from kinefit.takes.preparing.each_video import Tell
+from kinefit.takes.preparing.detecting import Tell
 from kinefit.takes.preparing.take import warn
 
 

@@ -24,7 +24,7 @@ from kinefit.readers.videos.sound import sound_offsets
 from kinefit.rigs.people.altered import refuse_videos
 from kinefit.rigs.people.calibrate import GUESSED_FOCAL_SIGMA, STATED_FOCAL_SIGMA, calibrate_people
 from kinefit.rigs.refine.gauge import resized
-from kinefit.takes.preparing.each_video import Step, Tell
+from kinefit.takes.preparing.detecting import Step, Tell
 from kinefit.takes.preparing.faces import ensure_faces
 from kinefit.takes.preparing.take import warn, with_detections
 

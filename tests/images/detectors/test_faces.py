@@ -100,7 +100,7 @@ def seated(data_dir):
 def test_the_mesh_of_a_seated_person_lies_on_the_pose_s_head(networks, seated):
     found = detect_people(
         seated, Models(networks), camera="c", rate=6.0, people=1, masks=False,
-        with_faces=FaceFinder(FaceModels(networks)),
+        adders={"face": FaceFinder(FaceModels(networks))},
     )  # fmt: skip
     keypoints = found.keypoints(face=True)
     assert keypoints.keypoint_set == "MEDIAPIPE_478" and (keypoints.confidence[:, 0] > 0.5).all()
@@ -120,7 +120,7 @@ def test_the_mesh_of_a_seated_person_lies_on_the_pose_s_head(networks, seated):
 def test_a_mirrored_face_has_the_mirrored_irises(networks, seated):
     models, image = FaceModels(networks), seated[0]
     points = detect_people(
-        seated, Models(networks), camera="c", rate=6.0, people=1, masks=False, with_faces=FaceFinder(models)
+        seated, Models(networks), camera="c", rate=6.0, people=1, masks=False, adders={"face": FaceFinder(models)}
     ).face[0, 0]
     roi, width = around_face(points), image.shape[1]
     mirrored = Roi(np.array([width - 1 - roi.centre[0], roi.centre[1]]), roi.side, -roi.turn)

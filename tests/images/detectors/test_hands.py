@@ -118,7 +118,7 @@ class Nobody:
 
 def test_hands_alone_have_a_column_of_their_own_in_detections():
     follower = HandFollower(Seen({(200, 300): 0.9}))
-    found = detect_people([IMAGE] * 4, Nobody(), camera="c", rate=10.0, masks=False, with_hands=follower)
+    found = detect_people([IMAGE] * 4, Nobody(), camera="c", rate=10.0, masks=False, adders={"hands": follower})
     assert found.hands.shape == (4, 1, 2, 21, 2) and found.seen.all() and found.mask(0, 0) is None
     keypoints = found.keypoints()
     assert keypoints.keypoint_set == "MEDIAPIPE_75" and len(keypoints.names) == 75
@@ -146,7 +146,7 @@ def test_a_bare_arm_s_hand_is_the_right_one(networks, data_dir):
         images = list(video.frames(20, 26))
     follower = HandFollower(HandModels(networks))
     found = detect_people(
-        images, Models(networks), camera="c", rate=30.0, people=0, masks=False, with_hands=follower
+        images, Models(networks), camera="c", rate=30.0, people=0, masks=False, adders={"hands": follower}
     )  # fmt: skip
     assert (found.hand_confidence[:, 0, 1] > 0.5).all() and (found.hand_confidence[:, 0, 0] == 0).all()
     assert np.linalg.norm(found.hands[0, 0, 1, 0] - [494, 188]) < 25
@@ -158,7 +158,7 @@ def test_both_hands_of_a_seated_person_keep_their_sides(networks, data_dir):
         images = list(video.frames(20, 26))
     follower = HandFollower(HandModels(networks))
     found = detect_people(
-        images, Models(networks), camera="c", rate=6.0, people=1, masks=False, with_hands=follower
+        images, Models(networks), camera="c", rate=6.0, people=1, masks=False, adders={"hands": follower}
     )  # fmt: skip
     assert (found.hand_confidence[:, 0].max(axis=2) > 0.5).mean() > 0.7
     wrists = found.points[:, 0, [15, 16]]

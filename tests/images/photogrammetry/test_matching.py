@@ -5,9 +5,8 @@ import pytest
 from tests.images.photogrammetry import scenes
 
 from kinefit.errors import ObservationError
-from kinefit.images.photogrammetry.least_squares_matching import match, windows_by_texture
+from kinefit.images.photogrammetry.least_squares_matching import match, variance_factor, windows_by_texture
 from kinefit.images.photogrammetry.matching import _kernels_matching as kernels
-from kinefit.images.photogrammetry.matching.noise_correlation import variance_factor
 from kinefit.images.photogrammetry.spline_image import SplineImage
 
 AT = np.stack(np.meshgrid(np.arange(30, 130, 12.0), np.arange(30, 90, 12.0)), axis=-1).reshape(-1, 2)

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinefit.markers.audit.audit import audit_take
-from kinefit.markers.audit.resting import resting_markers
+from kinefit.markers.audit.audit import audit_take, resting_markers
 
 FIRST = 60
 

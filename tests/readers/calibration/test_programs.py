@@ -561,10 +561,10 @@ def test_a_matlab_file_that_ends_its_reader_is_damaged(tmp_path, monkeypatch):
     with pytest.raises((FileError, CalibrationError), match="a.mat"):
         read_calibration(path)
     words = python("-c", "import os; os.abort()")
-    monkeypatch.setattr("kinefit.readers.calibration.matlab.python", lambda *_: words)
+    monkeypatch.setattr("kinefit.readers.calibration.programs.python", lambda *_: words)
     with pytest.raises(FileError, match=r"a\.mat: not a readable MATLAB file: scipy's reader crashes"):
         read_calibration(path)
     words[:] = python("-c", "import time; time.sleep(60)")
-    monkeypatch.setattr("kinefit.readers.calibration.matlab._MAX_READ_S", 0.2)
+    monkeypatch.setattr("kinefit.readers.calibration.programs._MAX_READ_S", 0.2)
     with pytest.raises(FileError, match="does not end within"):
         read_calibration(path)

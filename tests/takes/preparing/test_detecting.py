@@ -13,7 +13,7 @@ from kinefit.takes.preparing import detecting
 KEPT = [0, 1, 2, 4, 6, 8, 9, 10]  # steps of 50 Hz
 
 
-def look(images, models, *, camera, rate, people, masks, with_hands, with_faces, looks):
+def look(images, models, *, camera, rate, people, masks, adders, looks):
     """Nobody, in every image."""
     count = len(list(images))
     nothing = np.zeros(0, np.uint32), np.zeros(count + 1, int)
@@ -23,7 +23,7 @@ def look(images, models, *, camera, rate, people, masks, with_hands, with_faces,
 @pytest.fixture
 def found(write_frames, tmp_path, monkeypatch):
     monkeypatch.setattr("kinefit.images.detectors.box_detector.Models", lambda *given, **more: None)
-    monkeypatch.setattr("kinefit.images.detectors.detection.detect_people", look)
+    monkeypatch.setattr("kinefit.takes.preparing.detecting.detect_people", look)
 
     def run(steps, seconds=None):
         video = write_frames(tmp_path / "a.mp4", steps, size=(64, 48))

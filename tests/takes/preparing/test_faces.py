@@ -58,7 +58,7 @@ class Finds:
 
 @pytest.fixture
 def found(monkeypatch, tmp_path):
-    monkeypatch.setattr("kinefit.images.detectors.faces.FaceDetector", Finds)
+    monkeypatch.setattr("kinefit.takes.preparing.faces.FaceDetector", Finds)
     monkeypatch.setattr(faces, "networks", lambda progress, tell: SimpleNamespace(folder=tmp_path))
     monkeypatch.setattr(Finds, "images", 0)
 

@@ -10,7 +10,7 @@ from kinefit.observations import Detections
 from kinefit.readers.take.file import read_take
 from kinefit.readers.videos.video import Video
 from kinefit.takes.preparing import detecting, faces
-from kinefit.takes.preparing.take import FOLDER, hide_in_copies
+from kinefit.takes.preparing.faces import FOLDER, hide_in_copies
 
 
 class SeesMiddle:
@@ -35,7 +35,7 @@ def look(job, networks, settings, key, tell, threads):
 @pytest.fixture
 def take(copy_take, tmp_path, monkeypatch):
     networks = detecting.Networks(tmp_path, tmp_path, "best")
-    monkeypatch.setattr("kinefit.images.detectors.faces.FaceDetector", SeesMiddle)
+    monkeypatch.setattr("kinefit.takes.preparing.faces.FaceDetector", SeesMiddle)
     monkeypatch.setattr("kinefit.images.detectors.box_detector.Models", lambda *given, **more: None)
     monkeypatch.setattr(detecting, "networks", lambda *given: networks)
     monkeypatch.setattr(faces, "networks", lambda *given: networks)

@@ -57,7 +57,6 @@ def check(
     if points is not None and not points.is_file():
         raise click.BadParameter(f"no such file: {points}", param_hint="--points")
     from kinefit._files import write_text
-    from kinefit.cli._screen import check_file
     from kinefit.cli.checks._page import check_page
     from kinefit.cli.checks._refine import refined_of, write_refined
     from kinefit.findings import as_records, fixes, in_words, ranked
@@ -66,7 +65,7 @@ def check(
 
     take = find_take(take, wanted=("check",))
     out = out or take.with_name(f"{take.stem}-check.html")
-    check_file(out)
+    _screen.check_file(out)
     refined: Refined | None = None
     failed: KinefitError | None = None
     fixed: list[Edit] = []

@@ -15,7 +15,6 @@ from kinefit.bodies import Body, PointSet, load_body
 from kinefit.bodies.marker_sets import bare, find_marker_set, load_marker_set, matched
 from kinefit.bodies.motion import Motion, rotation_between_up
 from kinefit.cli import _screen
-from kinefit.cli._screen import Step, check_file, note
 from kinefit.errors import KinefitError, ObservationError, located
 from kinefit.exporters import write_markers, write_osim, write_trc
 from kinefit.exporters.gait.plates import standing_mass, stood_on
@@ -41,7 +40,7 @@ def read_file(path: str | PathLike[str], unit: str | None) -> Markers:
     """Read markers of a C3D or TRC file, and print what the reader notes on it."""
     markers = read_markers(path, unit=unit)
     for text in markers.notes:
-        note(f"{text}.")
+        _screen.note(f"{text}.")
     return markers
 
 
@@ -107,7 +106,7 @@ def identify_file(
     settings: takes.TakeSettings | None = None,
     unit: str | None = None,
     rest: bool = False,
-    step: Step | None = None,
+    step: _screen.Step | None = None,
     method: Callable[..., takes.TakeIdentification] = takes.identify_take,
 ) -> tuple[Markers, dict[str, takes.TakeIdentification], dict[str, Path]]:
     """Name the markers of a file and write it with labels, with a table of doubtful frames next to it.
@@ -134,7 +133,7 @@ def identify_file(
     """
     source = Path(path)
     target = Path(out) if out is not None else source.with_name(f"{source.stem}-named{source.suffix}")
-    check_file(target)
+    _screen.check_file(target)
     given = [model] if isinstance(model, MarkerModel | str | PathLike) else list(model)
     models = [m if isinstance(m, MarkerModel) else load_model(m) for m in given]
     markers = read_file(source, unit)
@@ -236,7 +235,7 @@ class MarkerFitOptions:
 
 def fit_file(
     path: Path, out: Path | None = None, options: MarkerFitOptions | None = None, *, unit: str | None = None,
-    formats: Iterable[str] = WRITTEN, step: Step | None = None, notes: list[Finding] | None = None,
+    formats: Iterable[str] = WRITTEN, step: _screen.Step | None = None, notes: list[Finding] | None = None,
 ) -> dict[str, tuple[Motion, dict[str, Path]]]:  # fmt: skip
     """Fit a file of labelled markers and write what was found.
 
@@ -276,7 +275,7 @@ def fit_file(
         markers = whole.trimmed()
         left_out = markers.notes[len(whole.notes) :]
         for text in left_out:
-            note(f"{text}.")
+            _screen.note(f"{text}.")
         trial = trials.get(person) or (next(iter(trials.values())) if len(trials) == 1 == len(people) else None)
         found_labels: tuple[Finding, ...] = ()
         for file, trial_markers in ((options.static, trial), (path, markers)):

@@ -20,9 +20,9 @@ from kinefit.bodies.motion import Motion
 from kinefit.errors import CalibrationError, FileError, ObservationError, TrackingError, shortened
 from kinefit.exporters import surface_files
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.images.photogrammetry.bright_points import BrightPointTracker
+from kinefit.images.photogrammetry.intersection import flat_camera
 from kinefit.images.photogrammetry.least_squares_matching import MIN_CORRELATION, Grid, Seeds, windows_by_texture
-from kinefit.images.photogrammetry.points.bright_points import BrightPointTracker
-from kinefit.images.photogrammetry.points.one_camera import flat_camera
 from kinefit.images.photogrammetry.spline_image import SplineImage, grey
 from kinefit.images.photogrammetry.surface import (
     MeasuredSurface,

@@ -266,12 +266,8 @@ def squares(width: int, height: int) -> list[tuple[int, int, int]]:
     return found
 
 
-def check_runtime() -> None:
-    """Raise ObservationError where the extra `detect` is not installed."""
-    _runtime()
-
-
-def _runtime() -> Any:
+def litert_interpreter() -> Any:
+    """The class of the networks' runtime, LiteRT; raises ObservationError where the extra `detect` is not installed."""
     try:
         from ai_edge_litert.interpreter import Interpreter
     except ImportError as error:
@@ -299,7 +295,7 @@ def interpreter(path: Path, threads: int, without: tuple[int, ...] = ()) -> Any:
     FileError
         The file is missing or not a network.
     """
-    runtime, remedy = _runtime(), _REMEDY if path.is_relative_to(cache_directory()) else _LAYOUT
+    runtime, remedy = litert_interpreter(), _REMEDY if path.is_relative_to(cache_directory()) else _LAYOUT
     if not path.is_file():
         raise FileError("no such network", file=path, remedy=remedy)
     try:

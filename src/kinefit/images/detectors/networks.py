@@ -90,14 +90,14 @@ class OnnxNetwork:
         try:
             self._session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # the runtime's errors have no base of their own
-            told = " ".join(str(error).split())[:300]
+            message = " ".join(str(error).split())[:300]
             remedy = "Export it anew for the installed onnxruntime, without operators of other runtimes."
-            raise FileError(f"not a network that onnxruntime runs ({told})", file=path, remedy=remedy) from error
+            raise FileError(f"not a network that onnxruntime runs ({message})", file=path, remedy=remedy) from error
         inputs = self._session.get_inputs()
         shape = list(inputs[0].shape) if len(inputs) == 1 else []
         if len(shape) != 4 or shape[1] != 3 or (shape[0] not in (1, None) and not isinstance(shape[0], str)):
-            told = ", ".join(f"{one.name} {list(one.shape)}" for one in inputs)
-            problem = f"its inputs are {told}, not one image (1, 3, height, width)"
+            listed = ", ".join(f"{one.name} {list(one.shape)}" for one in inputs)
+            problem = f"its inputs are {listed}, not one image (1, 3, height, width)"
             raise FileError(problem, file=path, remedy="Export it with one image as the input, its colours first.")
         if inputs[0].type not in _TYPES:
             remedy = "Export it with an input of float32 or float16."
@@ -123,8 +123,8 @@ class OnnxNetwork:
             found = self._session.run(names, {self._name: values})
             return {name: np.asarray(one, np.float32) for name, one in zip(names, found)}
         except Exception as error:  # as above
-            told = " ".join(str(error).split())[:300]
-            raise FileError(f"it cannot be run ({told})", file=self.path, remedy="Check the export.") from error
+            message = " ".join(str(error).split())[:300]
+            raise FileError(f"it cannot be run ({message})", file=self.path, remedy="Check the export.") from error
 
     def grey(self, values: CropInput) -> NDArray:
         """An input of a grey image."""
@@ -184,7 +184,7 @@ def recognised(network: OnnxNetwork, outputs: dict[str, NDArray]) -> tuple[SimCC
         Outputs of another kind of network, which is named where it is known.
     """
     (W, H), shapes = network.size, {name: one.shape for name, one in outputs.items()}
-    names, told = list(shapes), ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+    names, listed = list(shapes), ", ".join(f"{name} {shape}" for name, shape in shapes.items())
     if len(shapes) == 2 and all(len(s) == 3 and s[:2] == shapes[names[0]][:2] for s in shapes.values()):
         for x, y in (names, names[::-1]):
             bins = shapes[x][2] / W
@@ -195,7 +195,7 @@ def recognised(network: OnnxNetwork, outputs: dict[str, NDArray]) -> tuple[SimCC
         if (h, w) != (H, W) and 1 < W / w == H / h:
             return Heatmaps(names[0], (W / w, H / h)), K
     what, remedy = _other_kind(network, shapes)
-    raise FileError(f"{what}: its outputs are {told} for a crop of {W} x {H} px", file=network.path, remedy=remedy)
+    raise FileError(f"{what}: its outputs are {listed} for a crop of {W} x {H} px", file=network.path, remedy=remedy)
 
 
 def _other_kind(network: OnnxNetwork, shapes: dict[str, tuple[int, ...]]) -> tuple[str, str]:

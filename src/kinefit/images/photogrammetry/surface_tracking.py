@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from kinefit.bodies.motion import Motion
 from kinefit.errors import ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
-from kinefit.images.photogrammetry.intersection import Intersections, intersect
+from kinefit.images.photogrammetry import intersection
+from kinefit.images.photogrammetry import least_squares_matching as matching
+from kinefit.images.photogrammetry.intersection import Intersections, Ranges, body_ranges, intersect, plane_ranges
 from kinefit.images.photogrammetry.least_squares_matching import MIN_CORRELATION, WINDOW, Grid, Matches, Seeds, match
 from kinefit.images.photogrammetry.matching.multi_image import Correlations, search_box
-from kinefit.images.photogrammetry.points.one_camera import BODY_SIGMA, Ranges, at_range, body_ranges, plane_ranges
 from kinefit.images.photogrammetry.returning import PointReturn, Vanished
 from kinefit.images.photogrammetry.spline_image import SplineImage
 from kinefit.images.photogrammetry.surface import check_images, max_parallax, measure
@@ -157,7 +158,7 @@ class SurfaceTracker:
 
     def _append(self, points: SurfacePoints, added: SurfacePoints) -> SurfacePoints:
         """Append points, with the velocity of their nearest neighbours."""
-        shift = self._velocity[_nearest(points.uv[:, 0], added.uv[:, 0])]
+        shift = self._velocity[matching.nearest(added.uv[:, 0], points.uv[:, 0])]
         self._velocity = np.concatenate([self._velocity, shift])
         return SurfacePoints(*(np.concatenate([a, b]) for a, b in zip(vars(points).values(), vars(added).values())))
 
@@ -209,9 +210,9 @@ class SurfaceTracker:
         """Places in space of image points (N, C, 2) [px] of the next frame, with covariances (N, C, 2, 2) [px²]."""
         if self._ranges is None:
             return intersect(self.rig, uv, covariance)
-        sigma = 0.0 if self.motion is None else BODY_SIGMA
+        sigma = 0.0 if self.motion is None else intersection.BODY_SIGMA
         ranges = self._ranges(len(self._frames), uv[:, 0])
-        return at_range(self.rig.cameras[0], uv[:, 0], covariance[:, 0], ranges, sigma)
+        return intersection.at_range(self.rig.cameras[0], uv[:, 0], covariance[:, 0], ranges, sigma)
 
     def _new_ids(self, count: int) -> NDArray[np.int64]:
         """(count,) ids of new points."""
@@ -230,7 +231,7 @@ class SurfaceTracker:
             lost, tracked = np.flatnonzero(~good), np.flatnonzero(good)
             if not (len(lost) and len(tracked)):
                 break
-            other = tracked[_nearest(last.uv[tracked, 0], last.uv[lost, 0])]
+            other = tracked[matching.nearest(last.uv[lost, 0], last.uv[tracked, 0])]
             near = np.linalg.norm(last.uv[other, 0] - last.uv[lost, 0], axis=1) <= _MAX_STEPS_APART * settings.step
             differs = np.linalg.norm(velocity[other] - predicted[lost], axis=2).max(axis=1) > settings.reach / 2
             retried = near & differs
@@ -371,7 +372,7 @@ class SurfaceTracker:
 
     def _match_new(self, images: Sequence[SplineImage], points: SurfacePoints, at: NDArray) -> SurfacePoints:
         """Match new points (K, 2) [px] of the first image, starting from the maps of the nearest tracked ones."""
-        settings, near = self.settings, _nearest(points.uv[:, 0], at)
+        settings, near = self.settings, matching.nearest(at, points.uv[:, 0])
         uv = np.repeat(at[:, None], len(images), axis=1)
         covariance = np.tile(1e-6 * np.eye(2), (len(at), len(images), 1, 1))
         maps, good = points.deformation[near].copy(), np.ones(len(at), bool)
@@ -386,8 +387,3 @@ class SurfaceTracker:
         index = np.flatnonzero(good)
         kept = (intersections.x_world, intersections.covariance, uv, maps)
         return SurfacePoints(self._new_ids(len(index)), *(value[index] for value in kept))
-
-
-def _nearest(points: NDArray, at: NDArray) -> NDArray[np.int64]:
-    """(K,) index of the nearest of points (M, 2) to each of `at` (K, 2)."""
-    return np.array([np.argmin(((points - place) ** 2).sum(axis=1)) for place in at], np.int64)

@@ -13,18 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked, shaped
+from kinefit.markers.frame import explain
 from kinefit.markers.frame._kernels_evidence import place_joint
 from kinefit.markers.frame._kernels_posture import turn_costs
-from kinefit.markers.frame.explain import (
-    MAX_RIVAL_COST,
-    Solution,
-    explain,
-    gain_of,
-    labels_of,
-    refine,
-    rivals,
-    solution,
-)
+from kinefit.markers.frame.explain import MAX_RIVAL_COST, Solution, gain_of, labels_of, rivals
 from kinefit.markers.frame.search import LabelSearch, UnlabelledFrame
 from kinefit.markers.frame.tables import Beliefs, Identification, segment_tables
 from kinefit.markers.model.model import MarkerModel
@@ -103,9 +95,9 @@ def identify(
     expected_count = count * (1 - min(max(1 - len(at) / count, settings.miss), 0.5))
     work = np.full(1, SEARCH_WORK_SHARE * settings.work)
     frame = UnlabelledFrame(at, gaps, box, gain_of(expected_count, count, len(at), box), settings.gate, work, beliefs)
-    best = explain(model, frame, settings.finest, settings.coarsest, settings.searches)
+    best = explain.explain(model, frame, settings.finest, settings.coarsest, settings.searches)
     work += (1 - SEARCH_WORK_SHARE) * settings.work
-    best = refine(model, best)
+    best = explain.refine(model, best)
     before = shaped(np.full((count, 3), np.nan) if previous is None else previous, (count, 3), "previous positions")
     return _select_labels(model, best, before, settings.certain)
 
@@ -129,7 +121,7 @@ def _select_labels(model: MarkerModel, found: Solution, before: NDArray, certain
     for node, _ in chosen:
         if node.table.index not in examined:  # no work was left to search for rivals
             confidence[node.table.markers] = np.minimum(confidence[node.table.markers], 0.5)
-    found = solution(found.search, chosen, count)
+    found = explain.solution(found.search, chosen, count)
     _add_outliers(found, guess, confidence)
     known = (confidence >= certain) & (guess >= 0)
     assignment = np.where(known, guess, -1)

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.markers.frame._kernels_evidence import place_joint
-from kinefit.markers.frame._kernels_identify import range_cost
-from kinefit.markers.frame._kernels_nodes import cheapest_compatible, expand_segment
+from kinefit.markers.frame._kernels_identify import cheapest_compatible, expand_segment, range_cost
 from kinefit.markers.frame.tables import Beliefs, SegmentTable
 
 MAX_JOINT_SIGMA = 0.15

@@ -178,11 +178,10 @@ def _with_segment(peers: NDArray, ends: NDArray, x: NDArray) -> NDArray | None:
 
 def _cubic(x: NDArray, first: int, last: int) -> NDArray:
     """(n, 3) [m] cubic between the ends of a gap with the velocities of the adjacent frames."""
+    from scipy.interpolate import CubicHermiteSpline
+
     a, b = first - 1, last + 1
     span = b - a
     va = x[a] - x[a - 1] if a > 0 and np.isfinite(x[a - 1]).all() else (x[b] - x[a]) / span
     vb = x[b + 1] - x[b] if b + 1 < len(x) and np.isfinite(x[b + 1]).all() else (x[b] - x[a]) / span
-    u = (np.arange(1, span) / span)[:, None]
-    h00, h10 = 2 * u**3 - 3 * u**2 + 1, u**3 - 2 * u**2 + u
-    h01, h11 = -2 * u**3 + 3 * u**2, u**3 - u**2
-    return h00 * x[a] + h10 * span * va + h01 * x[b] + h11 * span * vb
+    return CubicHermiteSpline([a, b], [x[a], x[b]], [va, vb])(np.arange(first, b))

@@ -18,11 +18,9 @@ from kinefit._files import metres_of, parse_toml, read_bytes, read_text, write_t
 from kinefit.errors import CalibrationError, FileError, KinefitError, located, names_file
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
-from kinefit.readers.calibration.colmap import colmap_cameras
 from kinefit.readers.calibration.file_storage import parse_xml
 from kinefit.readers.calibration.keys import find
-from kinefit.readers.calibration.matlab import matlab_tree, read_mat
-from kinefit.readers.calibration.mocap import qualisys_cameras, vicon_cameras
+from kinefit.readers.calibration.programs import colmap_cameras, matlab_tree, qualisys_cameras, read_mat, vicon_cameras
 from kinefit.readers.calibration.tables import Sizes, camera_from_table, read_table
 from kinefit.readers.calibration.trees import stereo_tables, tables_of
 from kinefit.readers.plugins import CALIBRATIONS

@@ -10,8 +10,8 @@ import numpy as np
 
 from kinefit.errors import CalibrationError
 from kinefit.geometry.se3 import transform
-from kinefit.readers.calibration.colmap import image_names
 from kinefit.readers.calibration.keys import Table, find, kind_of, spelled, statements
+from kinefit.readers.calibration.programs import image_names
 from kinefit.readers.calibration.tables import numbers
 
 _KINDS_OF_PARTS = ("matrix", "distortion", "pose", "inverse pose", "lens model", "model")

@@ -20,9 +20,8 @@ from kinefit.errors import CalibrationError, ExportError, KinefitError, check_ch
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import inverse, log_so3
 from kinefit.readers.calibration import read
-from kinefit.readers.calibration.colmap import colmap_texts
 from kinefit.readers.calibration.keys import find, find_all
-from kinefit.readers.calibration.mocap import qualisys_text
+from kinefit.readers.calibration.programs import colmap_texts, qualisys_text
 from kinefit.readers.calibration.tables import is_transposed, read_table
 from kinefit.readers.calibration.trees import tables_of
 from kinefit.readers.ros.recordings import inside

@@ -23,7 +23,6 @@ from kinefit.readers.guess import views as guess_views
 from kinefit.readers.guess.draft import Draft, Value
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile, KeypointFile
 from kinefit.readers.guess.names import HOW, Trial, trials
-from kinefit.readers.guess.views import keypoint_entries, keypoint_sources, read_sources
 from kinefit.readers.take.cameras import DEFAULT_FIELD_OF_VIEW, turned_frame
 from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.videos.video import Video, common_frames
@@ -51,8 +50,8 @@ def describe_cameras(
         files = chosen.files if chosen else {}
         opened = {name: stack.enter_context(Video(path, rate=UNSTATED)) for name, path in files.items()}
         length = min(map(len, opened.values()), default=0)
-        sources = keypoint_sources(draft, keypoints, rig, length, chosen.place if chosen else "")
-        records = read_sources(draft, sources)
+        sources = guess_views.keypoint_sources(draft, keypoints, rig, length, chosen.place if chosen else "")
+        records = guess_views.read_sources(draft, sources)
         names = [name for name in rig.names if name in opened or any(name in record for record in records)]
         if not names:
             raise _nothing_fits(draft, calibration, found=bool(sources))
@@ -78,7 +77,7 @@ def describe_cameras(
         _world(draft, calibration, first, shown)
         _cut(draft, clocks, rate)
         for source, record, frame in entries:
-            keypoint_entries(draft, source, record, frame, images, active=record is first)
+            guess_views.keypoint_entries(draft, source, record, frame, images, active=record is first)
     if len(names) == 1:
         lifted = names[0] in opened and not first
         consequence = "the built-in detector estimates depth" if lifted else ONE_CAMERA

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,6 @@ from kinefit.observations import MEDIAPIPE_33, MEDIAPIPE_75, MEDIAPIPE_478, Keyp
 from kinefit.observations.arrays import sealed
 from kinefit.observations.detections import OPENPOSE_HAND_42
 from kinefit.observations.recordings import check_pixels, confidence_of
-
-if TYPE_CHECKING:
-    from kinefit.geometry.camera import ImageFrame
 
 _FACE_ARMS_LEGS = (
     "Nose LEye REye LEar REar LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle"
@@ -216,24 +213,22 @@ def known_set(names: Sequence[str], keypoint_set: str | None, file: Path) -> tup
 
 
 def keypoint_record(
-    data: NDArray, camera: str, keypoint_set: str, rate: float, time_offset: float, start: int, source: Path,
-    image_frame: ImageFrame | None, names: Sequence[str] = (),
+    data: NDArray, camera: str, keypoint_set: str, rate: float, source: Path, *, start: int = 0,
+    names: Sequence[str] = (),
 ) -> Keypoints:  # fmt: skip
     """Make a record of (F, P, K, 3) x, y [px], confidence 0..1; zeros where a point was not detected.
 
-    rate [Hz], time_offset [s], names of the points if the set is the user's own; raises ObservationError for a rate
-    that is not positive, and what `Keypoints` raises.
+    rate [Hz], number of the first frame, names of the points if the set is the user's own; raises ObservationError for
+    a rate that is not positive, and what `Keypoints` raises.
     """
     if not rate > 0 or not np.isfinite(rate):
         raise ObservationError(f"rate {rate} Hz", file=source, remedy="Give a positive frame rate.")
     what = f"keypoints of camera {camera}"
     points, confidence = data[..., :2], confidence_of(data[..., 2], what, source)
-    check_pixels(points, confidence, what, source)  # before they are converted
+    check_pixels(points, confidence, what, source)
     seen = (confidence > 0) | points.any(axis=-1)
-    if image_frame is not None:
-        points = image_frame.to_calibration(points)
     points = sealed(kept(np.where(seen[..., None], points, np.nan)))
     confidence = sealed(kept(np.where(seen, confidence, 0.0)))
-    offset = time_offset + start / rate
     names = tuple(names) or keypoint_names(keypoint_set)
-    return Keypoints(camera, keypoint_set, names, rate, points, confidence, time_offset=offset, source=str(source))
+    first = start / rate
+    return Keypoints(camera, keypoint_set, names, rate, points, confidence, time_offset=first, source=str(source))

@@ -21,22 +21,8 @@ from kinefit.observations import Keypoints
 from kinefit.observations.arrays import sealed
 from kinefit.observations.clocks import frames_by_name
 from kinefit.readers.depth.images import natural
-from kinefit.readers.landmarks.keypoint_sets import (
-    FACE_POINTS,
-    FACE_SET,
-    HAND_POINTS,
-    KEYPOINT_SETS,
-    MEDIAPIPE_SETS,
-    OPENPOSE_HANDS,
-    SET_OF_COUNT,
-    cut_frames,
-    face_mesh,
-    frame_numbers,
-    in_right_order,
-    keypoint_names,
-    keypoint_record,
-    stacked,
-)
+from kinefit.readers.landmarks import keypoint_sets
+from kinefit.readers.landmarks.keypoint_sets import FACE_POINTS, FACE_SET, HAND_POINTS, KEYPOINT_SETS, MEDIAPIPE_SETS
 from kinefit.readers.plugins import KEYPOINTS, FileFormat
 
 if TYPE_CHECKING:
@@ -125,29 +111,35 @@ def read_openpose(
         No such folder, or no json in it.
     """
     folder = Path(folder)
-    paths, start = cut_frames(_numbered_files(folder), frames, folder)
+    paths, start = keypoint_sets.cut_frames(_numbered_files(folder), frames, folder)
     people = [decoded(path, decode_openpose, "openpose") for path in paths]
     places = [(path, "") for path in paths]
-    return people_record(people, places, folder, camera, rate, keypoint_set, time_offset, start, image_frame)
+    record = people_record(people, places, folder, camera, rate, keypoint_set, start)
+    return _calibrated(record, time_offset, image_frame)
 
 
 def people_record(
     people: Sequence[Sequence[OpenPosePerson]], places: Sequence[tuple[Path, str]], source: Path, camera: str,
-    rate: float, keypoint_set: str | None, time_offset: float = 0.0, start: int = 0,
-    image_frame: ImageFrame | None = None,
+    rate: float, keypoint_set: str | None, start: int = 0,
 ) -> Keypoints:  # fmt: skip
     """The record of all people of every frame; `places` of the frames are their files and places there, for messages.
 
-    Others as in `read_openpose`, whose errors it raises.
+    `start` is the number of the first frame; others as in `read_openpose`, whose errors it raises.
     """
     if not any(people) and (source.is_dir() or len(people) != 1):
         raise _nobody(len(people), camera)
     first = next((len(persons[0].pose_keypoints_2d) // 3 for persons in people if persons), 0)
-    named = keypoint_set or SET_OF_COUNT.get(first, "BODY_25B")
+    named = keypoint_set or keypoint_sets.SET_OF_COUNT.get(first, "BODY_25B")
     numbers = [_numbers(persons, *place, named) for persons, place in zip(people, places, strict=True)]
-    data = stacked(numbers, len(keypoint_names(named)))
-    record = keypoint_record(data, camera, named, rate, time_offset, start, source, image_frame)
-    return in_right_order(record, stated=keypoint_set is not None)
+    data = keypoint_sets.stacked(numbers, len(keypoint_sets.keypoint_names(named)))
+    record = keypoint_sets.keypoint_record(data, camera, named, rate, source, start=start)
+    return keypoint_sets.in_right_order(record, stated=keypoint_set is not None)
+
+
+def _calibrated(record: Keypoints, time_offset: float, image_frame: ImageFrame | None) -> Keypoints:
+    """The record on the clock of all cameras, `time_offset` [s] later, and in the pixels of the calibration's image."""
+    points = record.points if image_frame is None else sealed(kept(image_frame.to_calibration(record.points)))
+    return replace(record, points=points, time_offset=record.time_offset + time_offset)
 
 
 def _nobody(frames: int, camera: str) -> ObservationError:
@@ -189,7 +181,7 @@ def read_mediapipe(
     if data.dtype.kind not in "fiu" or data.shape[1:] not in sets:
         remedy = "Give x, y [px], visibility: (frames, 33, 3), with hands (frames, 75, 3), of a face (frames, 478, 3)."
         raise ObservationError(f"landmarks have shape {data.shape}", remedy=remedy)
-    data, start = cut_frames(data, frames, path)
+    data, start = keypoint_sets.cut_frames(data, frames, path)
     data, keypoint_set = np.array(data, dtype=float), sets[data.shape[1:]]
     names = KEYPOINT_SETS[keypoint_set]
     pose = len(KEYPOINT_SETS["MEDIAPIPE_33"])
@@ -200,10 +192,11 @@ def read_mediapipe(
         remedy = "A frame without a person must be all NaN (or zero)."
         raise ObservationError(f"NaN or infinity at {names[point]}", place=f"frame {start + frame}", remedy=remedy)
     if keypoint_set == "MEDIAPIPE_478":
-        data = face_mesh(data)
+        data = keypoint_sets.face_mesh(data)
     if not data[..., 2].any():
         raise _nobody(len(data), camera)
-    return keypoint_record(data[:, None], camera, keypoint_set, rate, time_offset, start, path, image_frame)
+    record = keypoint_sets.keypoint_record(data[:, None], camera, keypoint_set, rate, path, start=start)
+    return _calibrated(record, time_offset, image_frame)
 
 
 _CALISCOPE_HANDS = (100, 200)  # first indices of the right and of the left hand
@@ -243,7 +236,7 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
     if not len(table):
         raise ObservationError("no landmark of the body in this table", remedy="Track the whole pose.")
     frame, port, point = (
-        frame_numbers(table[:, k], columns[k], from_first=columns[k] == "sync_index") for k in (0, 1, 3)
+        keypoint_sets.frame_numbers(table[:, k], columns[k], from_first=columns[k] == "sync_index") for k in (0, 1, 3)
     )
     keypoint_set = MEDIAPIPE_SETS[int(point.max() >= pose)]
     for k, begin in enumerate(_CALISCOPE_HANDS):  # the left hand comes first in the set
@@ -260,7 +253,7 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
         data = np.zeros((frame.max() + 1, 1, len(KEYPOINT_SETS[keypoint_set]), 3))
         rows = port == p
         data[frame[rows], 0, point[rows]] = np.column_stack([table[rows, 4:6], np.ones(rows.sum())])
-        keypoints[f"cam_{p}"] = keypoint_record(data, f"cam_{p}", keypoint_set, rate, 0.0, 0, path, None)
+        keypoints[f"cam_{p}"] = keypoint_sets.keypoint_record(data, f"cam_{p}", keypoint_set, rate, path)
     return keypoints
 
 
@@ -303,8 +296,7 @@ def read_keypoints(
         "read", path, camera=camera, rate=rate, **options, what=f"Keypoints of the camera '{camera}' at {rate} Hz",
         valid=lambda one: isinstance(one, Keypoints) and one.camera == camera and rate in (None, one.rate),
     )  # fmt: skip
-    points = record.points if image_frame is None else sealed(kept(image_frame.to_calibration(record.points)))
-    return replace(record, points=points, time_offset=record.time_offset + time_offset)
+    return _calibrated(record, time_offset, image_frame)
 
 
 def _is_caliscope(path: Path) -> bool:
@@ -348,7 +340,7 @@ def _freemocap_camera(path: Path, *, camera: str, rate: float | None, keypoint_s
     seen = np.isfinite(uv).all(axis=-1, keepdims=True)
     whole = np.where(seen, np.concatenate([uv, seen], axis=-1), 0.0)[:, None]
     name = FACE_SET if face else MEDIAPIPE_SETS[int(data.shape[2] > pose)]
-    return keypoint_record(whole, camera, name, rate or 1.0, 0.0, 0, path, None)
+    return keypoint_sets.keypoint_record(whole, camera, name, rate or 1.0, path)
 
 
 _OTHER_FILES = {  # what such a file has near its start, after spaces: what it is
@@ -417,8 +409,8 @@ def refuse_another(path: Path, format: str | None) -> None:
 
 def _numbers(people: Sequence[OpenPosePerson], path: Path, place: str, keypoint_set: str) -> NDArray:
     """(P, K, 3) x, y [px], confidence of all people of one frame."""
-    count = len(keypoint_names(keypoint_set))
-    values = [p.with_hands() if keypoint_set == OPENPOSE_HANDS else p.pose_keypoints_2d for p in people]
+    count = len(keypoint_sets.keypoint_names(keypoint_set))
+    values = [p.with_hands() if keypoint_set == keypoint_sets.OPENPOSE_HANDS else p.pose_keypoints_2d for p in people]
     for i, numbers in enumerate(values):
         if len(numbers) != 3 * count:
             fitting = [name for name in KEYPOINT_SETS if 3 * len(KEYPOINT_SETS[name]) == len(numbers)]

@@ -27,21 +27,14 @@ from numpy.typing import NDArray
 
 from kinefit._files import parse_toml, read_text, write_text
 from kinefit.errors import FileError, check_choice
+from kinefit.images.detectors import networks
 from kinefit.images.detectors.layouts import PointLayout
-from kinefit.images.detectors.networks import (
-    IMAGENET_MEAN,
-    IMAGENET_STD,
-    BoxPeople,
-    CropInput,
-    CropPoints,
-    OnnxNetwork,
-    OnnxPoints,
-)
+from kinefit.images.detectors.networks import IMAGENET_MEAN, IMAGENET_STD, CropInput, CropPoints
 from kinefit.observations import Keypoints
 from kinefit.readers.landmarks.keypoint_sets import HAND_POINTS, KEYPOINT_SETS
 from kinefit.readers.plugins import Extension, Extensions
 
-_SETS = ("COCO_17", "HALPE_26", "COCO_WHOLEBODY_133", "BODY_25", "MEDIAPIPE_33")  # told by the number of points
+_SETS = ("COCO_17", "HALPE_26", "COCO_WHOLEBODY_133", "BODY_25", "MEDIAPIPE_33")  # by their different numbers of points
 _CORRECT = "Correct the name there."
 
 _Three = tuple[float, float, float]
@@ -148,7 +141,7 @@ def open_points(network: Path, threads: int = 1) -> tuple[CropPoints, PointLayou
         )  # fmt: skip
         return found
     stated = read_description(network)
-    points = OnnxPoints(OnnxNetwork(network, threads, stated.size), stated.values, stated.outputs)
+    points = networks.OnnxPoints(networks.OnnxNetwork(network, threads, stated.size), stated.values, stated.outputs)
     keypoint_set, names = _names(network, stated, points.count)
     layout = PointLayout(keypoint_set, names, points.network.size)
     if not stated.mapping:
@@ -160,7 +153,7 @@ def open_points(network: Path, threads: int = 1) -> tuple[CropPoints, PointLayou
 class _Some:
     """Points of a network in another order, or some of them."""
 
-    points: OnnxPoints
+    points: networks.OnnxPoints
     order: NDArray
 
     def __call__(self, crop: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
@@ -200,14 +193,14 @@ def _names(network: Path, stated: NetworkDescription, count: int) -> tuple[str, 
     return keypoint_set, names
 
 
-def open_people(network: Path, threads: int = 1, aspect: float = 1.0) -> BoxPeople:
+def open_people(network: Path, threads: int = 1, aspect: float = 1.0) -> networks.BoxPeople:
     """A detector of people: YOLOX or RTMDet as ONNX; raises as `BoxPeople`, `OnnxNetwork` and `read_description`.
 
     `aspect`: height to width of the crops in which points are then looked for.
     """
     stated = read_description(network)
     values = stated.values if stated.mean or stated.std or stated.colours or stated.scale != 1.0 else None
-    return BoxPeople(OnnxNetwork(network, threads, stated.size), values, aspect)
+    return networks.BoxPeople(networks.OnnxNetwork(network, threads, stated.size), values, aspect)
 
 
 class NetworkSigma(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -319,12 +319,7 @@ def mcap_rig(path: Path) -> Rig:
                 f"no transform in {_STATIC} between the frames {frames[0]} (below {roots[0][0]}) and {frame} "
                 f"(below {root})", remedy=f"Record {_STATIC}, and publish where each camera stands.",
             )  # fmt: skip
-    return Rig(tuple(_placed(c, T) for c, (_, T) in zip(cameras, roots)))
-
-
-def _placed(c: Camera, T_world_camera: NDArray) -> Camera:
-    lens = () if c.distortion is None else tuple(c.distortion)
-    return Camera(c.name, c.size, c.matrix, lens, T_camera_world=se3.inverse(T_world_camera))  # type: ignore[arg-type]
+    return Rig(tuple(c.with_pose(se3.inverse(T)) for c, (_, T) in zip(cameras, roots)))
 
 
 def _infos(topics: Topics) -> dict[str, Any]:

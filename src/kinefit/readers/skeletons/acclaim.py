@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike, fspath
 
 import numpy as np
@@ -218,10 +218,9 @@ def _in_order(lines: list[tuple[int, list[str]]], loose: dict[str, Bone]) -> tup
     stack = ["root"]
     while stack:
         name = stack.pop()
-        bone = loose[name]
         index[name] = len(bones)
         above = index[parent_of[name]] if name in parent_of else -1
-        bones.append(Bone(name, above, bone.vector, bone.R_world_axes, bone.dofs, bone.limits))
+        bones.append(replace(loose[name], parent=above))
         stack.extend(reversed(children.get(name, [])))
     unreached = [name for name in loose if name not in index]
     if unreached:

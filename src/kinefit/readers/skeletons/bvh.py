@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike, fspath
 
 import numpy as np
@@ -144,8 +144,7 @@ def _read_hierarchy(text: str) -> list[_BvhJoint]:
                     or not all(re.fullmatch("[xyz](position|rotation)", channel) for channel in channels)
                 ):
                     raise fault(f"CHANNELS {count} {' '.join(channels)} is not a list of that many channels", line)
-                joint = joints[open_joints[-1]["index"]]
-                joints[open_joints[-1]["index"]] = _BvhJoint(joint.name, joint.parent, joint.offset, channels)
+                joints[open_joints[-1]["index"]] = replace(joints[open_joints[-1]["index"]], channels=channels)
             case "}" if open_joints and open_joints[-1]["index"] is not None:
                 open_joints.pop()
             case _:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from kinefit._files import LENGTHS, read_text, worth
 from kinefit.bodies.motion import UP_AXES
 from kinefit.errors import FileError, check_choice
+from kinefit.geometry.se3 import exp_so3
 
 
 def text_of(path: str | PathLike[str], kind: str) -> str:
@@ -25,24 +26,17 @@ def text_of(path: str | PathLike[str], kind: str) -> str:
 
 def parse_numbers(tokens: Sequence[str], line: int) -> list[float]:
     """Finite numbers of one line; raises FileError with the line."""
-    try:
-        values = [float(token) for token in tokens]
-    except ValueError:
-        bad = next(token for token in tokens if not _is_number(token))
-        remedy = "Export the motion again, with a point as the decimal mark."
-        raise FileError(f"'{bad}' is not a number", place=f"line {line}", remedy=remedy) from None
+    values = []
+    for token in tokens:
+        try:
+            values.append(float(token))
+        except ValueError:
+            remedy = "Export the motion again, with a point as the decimal mark."
+            raise FileError(f"'{token}' is not a number", place=f"line {line}", remedy=remedy) from None
     if not all(map(math.isfinite, values)):
         remedy = "Fill the gaps of the motion before exporting, or cut these frames out."
         raise FileError("holds a value that is not finite", place=f"line {line}", remedy=remedy)
     return values
-
-
-def _is_number(token: str) -> bool:
-    try:
-        float(token)
-    except ValueError:
-        return False
-    return True
 
 
 def euler_rotations(angles: NDArray, axes: Sequence[str]) -> NDArray:
@@ -60,14 +54,7 @@ def euler_rotations(angles: NDArray, axes: Sequence[str]) -> NDArray:
     """
     rotations = np.broadcast_to(np.eye(3), (*angles.shape[:-1], 3, 3))
     for k, axis in enumerate(axes):
-        i = "xyz".index(axis)
-        j, l = (i + 1) % 3, (i + 2) % 3
-        c, s = np.cos(angles[..., k]), np.sin(angles[..., k])
-        elementary = np.zeros((*angles.shape[:-1], 3, 3))
-        elementary[..., i, i] = 1.0
-        elementary[..., j, j] = elementary[..., l, l] = c
-        elementary[..., l, j], elementary[..., j, l] = s, -s
-        rotations = rotations @ elementary
+        rotations = rotations @ exp_so3(angles[..., k, None] * np.eye(3)["xyz".index(axis)])
     return rotations
 
 

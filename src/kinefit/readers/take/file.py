@@ -30,17 +30,9 @@ from kinefit.readers.depth.images import listed
 from kinefit.readers.guess.files import VIDEOS, stand_in
 from kinefit.readers.plugins import KEYPOINTS, MARKERS, install
 from kinefit.readers.ros.recordings import inside
+from kinefit.readers.take import entries
 from kinefit.readers.take.checks import check_take
-from kinefit.readers.take.entries import (
-    ATTRIBUTES,
-    NO_FILES,
-    RENAMED,
-    SINGLE_TABLES,
-    TABLES,
-    Take,
-    entry_class,
-    keys_of,
-)
+from kinefit.readers.take.entries import ATTRIBUTES, NO_FILES, SINGLE_TABLES, TABLES, Take
 from kinefit.readers.take.kinds import BUILT_IN, KINDS, WrongEntryError
 
 __all__ = ["Take", "read_take"]
@@ -72,7 +64,7 @@ def read_take(path: str | PathLike[str]) -> Take:
     for row in marked if isinstance(marked, list) else ():
         if isinstance(row, dict) and str(row.get("set", "")).endswith(".toml"):
             row["set"] = str(_there(path.parent, row["set"]))
-    of_kinds = {table: entry_class(table) for table in KINDS.names() if table in raw}
+    of_kinds = {table: entries.entry_class(table) for table in KINDS.names() if table in raw}
     head["sensors"] = {t: _converted({t: raw.pop(t)}, tuple[of_kinds[t], ...], path, t) for t in of_kinds}  # type: ignore
     take: Take = _converted(head | {ATTRIBUTES.get(table, table): rows for table, rows in raw.items()}, Take, path)
     check_take(take)
@@ -144,10 +136,10 @@ def _tidy(raw: dict[str, Any], path: Path, text: str) -> None:
 
 def _rename(table: str, row: dict[str, Any], path: Path, place: str) -> None:
     """Put the new name of a key in place of its old one, and say so; refuse one that there is not."""
-    known, old_names = keys_of(table), RENAMED.get(table, {})
+    known, old_names = entries.keys_of(table), entries.RENAMED.get(table, {})
     for old in [key for key in row if key not in known]:
         if old not in old_names:
-            tables = [name for name in (*TABLES, *BUILT_IN) if old in keys_of(name)]
+            tables = [name for name in (*TABLES, *BUILT_IN) if old in entries.keys_of(name)]
             holding = ", ".join(f"[{name}]" if name in SINGLE_TABLES else f"[[{name}]]" for name in tables)
             raise TakeError(choices("key", old, known), remedy=f"'{old}' belongs to {holding}." if holding else None)
         new = old_names[old]
@@ -260,7 +252,7 @@ def wrong_value(error: msgspec.ValidationError, content: Mapping[str, Any], path
         place = f"{where}, {key}" if key else where
     if isinstance(cause := error.__cause__, WrongEntryError):
         return TakeError(cause.problem, file=path, place=where, remedy=cause.remedy)
-    hints = list(_parts(get_type_hints(entry_class(table), include_extras=True).get(key)))
+    hints = list(_parts(get_type_hints(entries.entry_class(table), include_extras=True).get(key)))
     listed = next((", ".join(map(repr, get_args(hint))) for hint in hints if get_origin(hint) is Literal), "")
     if re.match(r"Expected `\w+` [<>]", message):
         remedy = next(m.description for hint in hints for m in getattr(hint, "__metadata__", ()))

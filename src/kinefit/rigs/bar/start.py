@@ -32,12 +32,11 @@ _MIN_PARALLAX = np.radians(2.0)  # between rays: with less distances are undeter
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two cameras that agree: indices in the rig, cameras with focal length and pose, agreeing share, score."""
+    """Two cameras that agree: indices in the rig, cameras with focal length and pose, score."""
 
     first: int
     second: int
     cameras: tuple[Camera, Camera]
-    agree: float
     worth: float
 
 
@@ -104,7 +103,7 @@ def first_pairs(cameras: Sequence[Camera], uv: NDArray, known: bool, length: flo
             reasons[f"all places that {name} share lie in one plane, or both cameras are nearly in one place"] = 1.0
             continue
         for metric, gain in _metric((cameras[i], cameras[j]), F, a[inside], b[inside], known, length):
-            pairs.append(Pair(i, j, metric, share, gain * share))
+            pairs.append(Pair(i, j, metric, gain * share))
     if not pairs:
         worst = max(reasons, key=reasons.__getitem__, default="no two cameras see it from different sides")
         flatness = "plane" in worst
@@ -239,13 +238,11 @@ def _alike(a: tuple[Camera, Camera], b: tuple[Camera, Camera]) -> bool:
 
 def _posed(E: NDArray, a: NDArray, b: NDArray) -> tuple[NDArray, NDArray, float, float] | None:
     """T_b_a with |t| = 1, lengths of the bar (M,), median angle of the rays, share in front: the best of four poses."""
-    u, _, vt = np.linalg.svd(E)
-    W = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    R_a, R_b, way = cv2.decomposeEssentialMat(E)
     rays = [np.concatenate([p.reshape(-1, 2), np.ones((p.size // 2, 1))], axis=1) for p in (a, b)]
     best = None
-    for R in (u @ W @ vt, u @ W.T @ vt):
-        R = R * np.sign(np.linalg.det(R))
-        for t in (u[:, 2], -u[:, 2]):
+    for R in (R_a, R_b):
+        for t in (way.ravel(), -way.ravel()):
             # nearest points of the rays s p from the first camera and r Rᵀ q from the second at -Rᵀ t
             p, q, centre = rays[0], rays[1] @ R, -R.T @ t
             pp, qq, pq = (np.sum(x * y, axis=1) for x, y in ((p, p), (q, q), (p, q)))

@@ -6,7 +6,7 @@ Read the centroids of a bar's targets from a table.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -19,7 +19,7 @@ from kinefit._arguments import checked
 from kinefit._files import no_column, regular
 from kinefit.errors import CalibrationError, FileError
 from kinefit.rigs.board.detection import grey_image
-from kinefit.rigs.board.sources import Frames, NumberedImages, evenly, opened, sample
+from kinefit.rigs.board.sources import Frames, NumberedImages, Progress, evenly, opened, sample
 
 _BACKGROUND_IMAGES = 25  # whose median is the scene without the bar: it is elsewhere in more than half of them
 _SPOT_LEVEL = 0.3  # of the way from the background to the peak: lower grey values are no part of a target
@@ -28,8 +28,6 @@ _MIN_CONTRAST = 30.0  # grey values above the background: less is noise and JPEG
 _MAX_SPOT_SIZE = 0.06  # of the image's width
 _MAX_ASPECT = 3.0  # length over width of a target that moves during exposure; longer spots are reflections
 _MIN_SPOT_PIXELS = 3  # for a centroid
-
-Progress = Callable[[str, int, int], object]
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,12 +126,9 @@ def targets_in(grey: NDArray, still: NDArray | None = None) -> NDArray:
 
 def _centroid(weight: NDArray) -> tuple[NDArray, float]:
     """Centroid (u, v) of weights (H, W), and their aspect ratio (length over width)."""
-    v, u = np.mgrid[: weight.shape[0], : weight.shape[1]]
-    total = float(weight.sum())
-    centre = np.array([np.sum(u * weight), np.sum(v * weight)]) / total
-    du, dv = u - centre[0], v - centre[1]
-    spread = np.array([[np.sum(weight * du * du), np.sum(weight * du * dv)], [0.0, np.sum(weight * dv * dv)]]) / total
-    spread[1, 0] = spread[0, 1]
+    m = cv2.moments(weight)
+    centre = np.array([m["m10"], m["m01"]]) / m["m00"]
+    spread = np.array([[m["mu20"], m["mu11"]], [m["mu11"], m["mu02"]]]) / m["m00"]
     small, large = np.linalg.eigvalsh(spread + np.eye(2) / 12.0)  # 1/12: variance of one pixel
     return centre, float(np.sqrt(large / small))
 

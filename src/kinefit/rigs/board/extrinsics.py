@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit.errors import CalibrationError, choices
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.se3 import inverse, transform
+from kinefit.geometry.se3 import aligned, inverse, transform
 from kinefit.rigs.board.bundle import Corners
 from kinefit.rigs.board.detection import Board, BoardView, CameraViews
 
@@ -96,19 +96,6 @@ def _poses(camera: Camera, view: BoardView, board: Board) -> Poses:
     return Poses(view, np.array(kept).reshape(-1, 4, 4), xy)
 
 
-def _turned(board: Board) -> list[NDArray]:
-    """T_board_board (4, 4) of every rotation that maps the board onto itself."""
-    out = []
-    for order in board.symmetries:
-        flat, turned = board.corners[:, :2], board.corners[order][:, :2]
-        a, b = flat - flat.mean(axis=0), turned - turned.mean(axis=0)
-        u, _, vt = np.linalg.svd(b.T @ a)
-        R = np.eye(3)
-        R[:2, :2] = u @ vt
-        out.append(transform(R, np.append(turned.mean(axis=0) - R[:2, :2] @ flat.mean(axis=0), 0.0)))
-    return out
-
-
 def _view_error(T_camera_board: NDArray, poses: Poses, board: Board) -> float:
     """Median distance of a view's corners from their projections at a pose of the board, in normalised coordinates."""
     return min(_symmetry_errors(T_camera_board, poses, board))
@@ -127,7 +114,7 @@ def _vote(camera: Camera, pairs: list[tuple[Poses, Poses]], board: Board) -> tup
     limit = _MAX_ERROR * float(np.hypot(*camera.size)) / camera.matrix[0, 0]
     chosen = [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_PROPOSALS)).astype(int))]
     best, best_T, best_agree = np.inf, np.eye(4), 0
-    turns = _turned(board)
+    turns = [aligned(board.corners, board.corners[order]) for order in board.symmetries]  # T_board_board
     for a, b in chosen:
         for T_a, T_b, turn in product(a.Ts_camera_board, b.Ts_camera_board, turns):
             T_b_a = T_b @ turn @ inverse(T_a)

@@ -14,14 +14,8 @@ from numpy.typing import NDArray
 from kinefit._pictures import read_picture
 from kinefit.errors import CalibrationError, FileError
 from kinefit.readers.videos.video import Video
-from kinefit.rigs.board.detection import (
-    Board,
-    BoardView,
-    CameraViews,
-    Finder,
-    fitting_boards,
-    with_dictionary,
-)
+from kinefit.rigs.board import detection
+from kinefit.rigs.board.detection import Board, CameraViews
 
 _IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mts", ".wmv")
@@ -174,10 +168,10 @@ def find_boards(
     with opened(sources) as cameras:
         wanted = evenly(cameras, max_frames, include)
         if board.kind == "charuco" and not board.dictionary:
-            board = with_dictionary(board, [image for o in cameras.values() for image in sample(o, 4)])
-        finder, seen, total = Finder(board), {}, len(wanted) * len(cameras)
+            board = detection.with_dictionary(board, [image for o in cameras.values() for image in sample(o, 4)])
+        finder, seen, total = detection.Finder(board), {}, len(wanted) * len(cameras)
         for n, (name, camera) in enumerate(cameras.items()):
-            views: list[BoardView] = []
+            views: list[detection.BoardView] = []
             own = set(camera.numbers)
             for i, frame in enumerate(wanted):
                 view = finder.find(camera.read(frame), frame) if frame in own else None
@@ -247,7 +241,7 @@ def _raise_unseen(board: Board, unseen: list[str], opened: Mapping[str, Numbered
             remedy="Show the board to every camera, so near that its squares are 20 px or more; or remove the camera.",
         )
     images = [image for name in unseen for image in sample(opened[name], _SUGGESTION_IMAGES)]
-    fits = fitting_boards(board, images[: 2 * _SUGGESTION_IMAGES])
+    fits = detection.fitting_boards(board, images[: 2 * _SUGGESTION_IMAGES])
     tried = "other dictionaries, the legacy pattern and the board turned" if board.kind == "charuco" else "other sizes"
     found = f"one fits --board {fits[0]}" if fits else f"nor with {tried}"
     size = "squares" if board.kind == "charuco" else "inner corners, which are one less than squares"
@@ -261,7 +255,7 @@ def _raise_unseen(board: Board, unseen: list[str], opened: Mapping[str, Numbered
 def _check_whole(board: Board, seen: Mapping[str, CameraViews], opened: Mapping[str, NumberedImages | Frames]) -> None:
     """Raise CalibrationError if the board is a part of a larger one: the part would differ between images."""
     shown = [source.read(seen[name].views[i].frame) for name, source in opened.items() for i in (0, -1)]
-    for other in fitting_boards(board, shown[:4])[:1]:
+    for other in detection.fitting_boards(board, shown[:4])[:1]:
         size, larger = sorted(board.size), sorted(other.size)
         if size != larger and all(a <= b for a, b in zip(size, larger)):
             raise CalibrationError(

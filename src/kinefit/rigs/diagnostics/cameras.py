@@ -17,16 +17,8 @@ from numpy.typing import NDArray
 
 from kinefit.errors import command
 from kinefit.findings import SEVERITIES, Edit, Finding, Severity, listed
-from kinefit.fitting.multiview.views import (
-    KeypointViews,
-    disagreement_share,
-    from_others,
-    median_error,
-    meet,
-    pair_misses,
-    sample,
-    share_against_others,
-)
+from kinefit.fitting.multiview import views as keypoint_views
+from kinefit.fitting.multiview.views import KeypointViews, disagreement_share, median_error, meet, sample
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
 
 FOREIGN_ERROR = 0.5
@@ -70,7 +62,7 @@ def odd_camera(views: KeypointViews) -> int | None:
     without = [median_error(rest.rig, sample(rest)) for rest in map(views.without, range(len(views.rig)))]
     odd = int(np.argmin(without))
     agrees = without[odd] > _MAX_ERROR_WITHOUT * min(without[:odd] + without[odd + 1 :])
-    return None if agrees or share_against_others(views, odd) < _MIN_ODD_ERROR_SHARE else odd
+    return None if agrees or keypoint_views.share_against_others(views, odd) < _MIN_ODD_ERROR_SHARE else odd
 
 
 def stranger_findings(views: KeypointViews) -> list[Finding]:
@@ -78,14 +70,14 @@ def stranger_findings(views: KeypointViews) -> list[Finding]:
 
     The views must be synchronised, with gross mistakes corrected.
     """
-    misses = pair_misses(views)
+    misses = keypoint_views.pair_misses(views)
     bad, known = views.limit / 2, ~np.isnan(misses)
     if not known.any():
         remedy = "Point the cameras at the same place, and check that their keypoints are of one recording."
         return [Finding("fault", "apart", "No two cameras see the same points.", remedy=remedy)]
     odd, names = odd_camera(views), views.rig.names
     if odd is not None:
-        error = share_against_others(views, odd) * views.limit
+        error = keypoint_views.share_against_others(views, odd) * views.limit
         text = f"{names[odd]} disagrees with the other cameras: its keypoints are {error:.0f} px or more off theirs."
         return [_stranger_finding(names[odd], text)]
     agree = misses <= bad
@@ -211,7 +203,7 @@ def camera_biases(views: KeypointViews) -> tuple[CameraBias, ...]:
         bias, std = _median_bias(d)
         alone = np.full(2, np.nan)
         if len(views.rig) > 2:
-            alone, _ = _median_bias(from_others(views, c) - views.uv[:, :, c], limit=views.limit)
+            alone, _ = _median_bias(keypoint_views.from_others(views, c) - views.uv[:, :, c], limit=views.limit)
         apart = np.linalg.norm(d - bias, axis=-1)[used]
         spread = float(np.median(apart)) if len(apart) else np.nan
         outliers = 1.0 - float(used.sum() / compared.sum()) if compared.any() else np.nan

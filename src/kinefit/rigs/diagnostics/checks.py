@@ -24,9 +24,7 @@ from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.videos import TakePictures
 from kinefit.rigs.diagnostics import cameras, changes, images, lenient, mistakes, person, rig, timing
-from kinefit.rigs.diagnostics.cameras import CameraBias
 from kinefit.rigs.diagnostics.rig import CameraCoverage
-from kinefit.rigs.diagnostics.timing import TimeOffsets
 from kinefit.sensors.alignment import SensorAlignment
 
 Progress = Callable[[str, int, int], None]
@@ -115,9 +113,9 @@ class Checked:
     stepped: KeypointViews = _UNKNOWN
     sampled: KeypointViews = _UNKNOWN
     x: NDArray = _UNKNOWN
-    biases: tuple[CameraBias, ...] = ()
+    biases: tuple[cameras.CameraBias, ...] = ()
     coverage: tuple[CameraCoverage, ...] = ()
-    times: TimeOffsets = _UNKNOWN
+    times: timing.TimeOffsets = _UNKNOWN
     frames_late: Mapping[str, int] = _UNKNOWN
     sensors: tuple[SensorAlignment, ...] = ()
 

@@ -18,7 +18,6 @@ from kinefit.findings import Edit, Finding, listed
 from kinefit.fitting.multiview.views import KeypointViews, disagreement_share, points_of_others, sample, share_against
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.se3 import inverse
 from kinefit.rigs.diagnostics.cameras import FOREIGN_ERROR, odd_camera
 
 _MIN_ERROR_SHARE = 0.25  # mean error of all views, as a share of the limit: less is no gross mistake
@@ -195,11 +194,11 @@ def _conventions() -> Iterator[Trial]:
     """Poses in another convention than OpenCV's."""
     remedy = "Export the calibration with poses from world to camera, x right, y down, z ahead (OpenCV's convention)."
     changes: dict[str, Callable[[NDArray], NDArray]] = {
-        "the poses are camera to world instead of world to camera": inverse,
+        "the poses are camera to world instead of world to camera": se3.inverse,
         "the camera axes are those of computer graphics (y up, z backward), not y down, z ahead":
             _FROM_OPENGL.__matmul__,
         "the poses are camera to world with the axes of computer graphics (y up, z backward)":
-            lambda T: _FROM_OPENGL @ inverse(T),
+            lambda T: _FROM_OPENGL @ se3.inverse(T),
     }  # fmt: skip
     for text, change in changes.items():
         yield Mistake("poses", text, remedy), partial(_posed, change=change)
@@ -264,9 +263,9 @@ def _orders(cameras: int) -> Iterator[tuple[int, ...]]:
 
 def _negated(T_camera_world: NDArray, axis: int, in_world: bool) -> NDArray:
     """A pose (4, 4) with the sign of one coordinate of its translation, or position in the world, changed."""
-    out = np.array(inverse(T_camera_world) if in_world else T_camera_world)
+    out = np.array(se3.inverse(T_camera_world) if in_world else T_camera_world)
     out[axis, 3] *= -1.0
-    return inverse(out) if in_world else out
+    return se3.inverse(out) if in_world else out
 
 
 def _posed(camera: Camera, uv: NDArray, change: Callable[[NDArray], NDArray]) -> tuple[Camera, NDArray]:

@@ -17,15 +17,9 @@ from numpy.typing import NDArray
 
 from kinefit.errors import TrackingError
 from kinefit.findings import Edit, Finding, Severity, in_words, listed
+from kinefit.fitting.multiview import views as keypoint_views
 from kinefit.fitting.multiview.association import medians
-from kinefit.fitting.multiview.views import (
-    KeypointViews,
-    disagreement_share,
-    make_views,
-    meet,
-    sample,
-    with_sides_right,
-)
+from kinefit.fitting.multiview.views import KeypointViews, disagreement_share, meet, sample
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Keypoints
 from kinefit.rigs.diagnostics.cameras import MIN_SIGMAS, without_points
@@ -277,14 +271,14 @@ def synchronised(views: KeypointViews) -> tuple[TimeOffsets, KeypointViews, dict
 
     Sides can only be corrected in synchronised cameras, offsets only estimated from correct sides: two rounds do both.
     """
-    right = with_sides_right(views)
+    right = keypoint_views.with_sides_right(views)
     times = time_offsets(right)
     late = np.where(np.isfinite(times.frames) & (times.std * times.rate < 0.25), times.frames, 0.0)
     late = np.where(np.abs(late) > 0.75, late, 0.0)
     if not late.any():
         return times, right, {}
     delays = np.round(late + (views.begins - np.median(views.begins)) * views.rate)
-    moved = with_sides_right(shifted(views, delays))
+    moved = keypoint_views.with_sides_right(shifted(views, delays))
     ratio = _MAX_SHARE_RATIO if np.abs(late).max() > _FAR_FRAMES else 1.0
     if disagreement_share(moved.rig, sample(moved)) > ratio * disagreement_share(right.rig, sample(right)):
         return time_offsets(right, near=True), right, {}  # of a periodic motion another period
@@ -403,7 +397,7 @@ def _part(rig: Rig, keypoints: Sequence[Keypoints], start: int, stop: int) -> _P
     advantage, cost = np.full((2, len(rig), len(rig)), np.nan)
     try:
         records = [k.rows(slice(begin, begin + count), k.time_offset) for k in keypoints]
-        curves = pair_curves(with_sides_right(make_views(rig, records, filled=True)))
+        curves = pair_curves(keypoint_views.with_sides_right(keypoint_views.make_views(rig, records, filled=True)))
     except TrackingError:  # no person detected
         curves = {}
     for pair, (shifts, costs) in curves.items():

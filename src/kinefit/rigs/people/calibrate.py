@@ -21,6 +21,8 @@ from kinefit.bodies.motion import rotation_between_up
 from kinefit.errors import CalibrationError
 from kinefit.fitting.multiview.association import person_records
 from kinefit.fitting.smoothing.foot_contacts import fit_plane, upward
+from kinefit.fitting.subject.subject import Progress
+from kinefit.fitting.tracking.recording import spread
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.lines import triangulate, triangulate_robust
@@ -28,7 +30,7 @@ from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.rigs.people.skeletons import first_cameras, in_step, steady_person
 from kinefit.rigs.refine.gauge import resized
 from kinefit.rigs.refine.refine import Length, check_input, length_of, prior_sigma, refine_from
-from kinefit.rigs.refine.result import PersonSighting, PersonTrial, Progress, Refinement
+from kinefit.rigs.refine.result import PersonSighting, PersonTrial, Refinement
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solving.bundle.adjust import BundleState, adjust
 from kinefit.solving.bundle.cameras import FOCAL, TIME, CameraPrior, PointPixels
@@ -90,8 +92,8 @@ def _normalised(camera: Camera, uv: NDArray) -> NDArray:
     return np.where(ray[:, 2:] > 1e-6, ray[:, :2] / np.where(ray[:, 2:] > 1e-6, ray[:, 2:], 1.0), np.nan)
 
 
-def _thinned(index: NDArray) -> NDArray:
-    return index[np.unique(np.linspace(0, len(index) - 1, min(len(index), _MAX_KEYPOINTS)).astype(int))]
+def _thinned(index: NDArray, most: int = _MAX_KEYPOINTS) -> NDArray:
+    return index[spread(len(index), most)]
 
 
 def _relative_pose(rig: Rig, flat: NDArray, i: int, j: int, sigma: float) -> tuple[NDArray, float] | None:
@@ -287,14 +289,14 @@ def calibrate_people(
     (points, uv), *further = seen
     rig = first or first_rig(given, uv.reshape(-1, len(given), 2), sigma)
     step("first cameras", 1, 2)
-    spread = np.broadcast_to(GUESSED_FOCAL_SIGMA if focal is True else focal, len(given)).astype(float)
+    focal_sigma = np.broadcast_to(GUESSED_FOCAL_SIGMA if focal is True else focal, len(given)).astype(float)
     clock = _NEAR_CLOCKS if time_offsets else 0.0
-    rig, x = _adjusted(rig, given, [u for _, u in seen], sigma, focal=spread, clock=clock, rate=rate)
+    rig, x = _adjusted(rig, given, [u for _, u in seen], sigma, focal=focal_sigma, clock=clock, rate=rate)
     factor = _whole_scale(body, points, x, height)
     rig = settled(resized(rig, factor), factor * x, _above_soles(body, points), up=up)
     step("first cameras", 2, 2)
-    prior_std = prior_sigma(len(rig), focal=bool(spread.any()), distortion=False, time_offsets=bool(time_offsets))
-    prior_std[:, :3], prior_std[:, 3:6], prior_std[:, FOCAL] = *_FLAT_POSE_SIGMAS, spread
+    prior_std = prior_sigma(len(rig), focal=bool(focal_sigma.any()), distortion=False, time_offsets=bool(time_offsets))
+    prior_std[:, :3], prior_std[:, 3:6], prior_std[:, FOCAL] = *_FLAT_POSE_SIGMAS, focal_sigma
     prior = CameraPrior(Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True))), prior_std)
 
     def stand(rig: Rig, seen: PersonSighting) -> tuple[Rig, str]:
@@ -325,9 +327,7 @@ def free_points(rig: Rig, people: Sequence[NDArray], sigma: float) -> PointPixel
     """
     flat = np.concatenate([np.zeros((0, len(rig), 2)), *(uv.reshape(-1, len(rig), 2) for uv in people)])
     agree = triangulate_robust(rig, flat, max_residual_px=2.0 * _MAX_RAY_SIGMAS * sigma)[1]
-    good = np.flatnonzero(agree.sum(axis=1) >= 2)
-    some = np.linspace(0, max(len(good) - 1, 0), min(_MAX_OTHER_POINTS, len(good)))
-    good = good[np.unique(some.astype(int))]
+    good = _thinned(np.flatnonzero(agree.sum(axis=1) >= 2), _MAX_OTHER_POINTS)
     point, camera = np.nonzero(agree[good] & np.isfinite(flat[good]).all(axis=-1))
     return PointPixels(camera, point, flat[good][point, camera], np.full(len(point), sigma**-2))
 
@@ -351,8 +351,7 @@ def _adjusted(
     flat = np.concatenate([uv.reshape(-1, len(rig), 2) for uv in people])
     speed = np.concatenate([np.gradient(uv, axis=0).reshape(-1, len(rig), 2) for uv in people])
     speed = np.nan_to_num(speed * rate)
-    many = np.flatnonzero(np.isfinite(flat).all(axis=-1).sum(axis=1) >= 2)
-    many = many[np.unique(np.linspace(0, len(many) - 1, min(_MAX_POINTS, len(many))).astype(int))]
+    many = _thinned(np.flatnonzero(np.isfinite(flat).all(axis=-1).sum(axis=1) >= 2), _MAX_POINTS)
     offsets = np.zeros(len(rig))
     for coarse in _LOSS_SIGMAS:
         size = float(np.linalg.norm(np.ptp([c.centre_world for c in rig], axis=0)))

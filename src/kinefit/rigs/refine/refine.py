@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked, renamed
 from kinefit.bodies import Body
 from kinefit.errors import CalibrationError, ObservationError, TrackingError
+from kinefit.fitting.subject.subject import Progress
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.lines import triangulate
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
@@ -63,7 +64,7 @@ def refine(
     known_length: Length | None = None,
     up: str = "z",
     sigma: float = KEYPOINT_SIGMA,
-    progress: result.Progress | None = None,
+    progress: Progress | None = None,
 ) -> result.Refinement:
     """Refine a rig by the person in view, and by static points if given.
 
@@ -111,7 +112,7 @@ def prior_sigma(cameras: int, *, focal: bool, distortion: bool, time_offsets: bo
 
 def refine_from(
     rig: Rig, trial: result.PersonTrial, prior: CameraPrior, gauge: Gauge, *, static_points: StaticPoints | None = None,
-    free: PointPixels | None = None, progress: result.Progress | None = None, from_scratch: bool = False,
+    free: PointPixels | None = None, progress: Progress | None = None, from_scratch: bool = False,
 ) -> result.Refinement:  # fmt: skip
     """Refine as `refine`, from any start with any prior.
 

@@ -5,7 +5,7 @@ Track one person with a rig, and prepare the measurements for a bundle adjustmen
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from kinefit.fitting.multiview.association import choose_people, person_records
 from kinefit.fitting.subject.keypoints import fit_subject
 from kinefit.fitting.subject.parameters import PointOffsets
 from kinefit.fitting.subject.subject import Subject
-from kinefit.fitting.tracking.recording import Recording
+from kinefit.fitting.tracking.recording import Recording, spread
 from kinefit.fitting.tracking.video import track
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Keypoints
@@ -26,8 +26,6 @@ from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solving.bundle.adjust import Bundle, BundleState, adjust
 from kinefit.solving.bundle.cameras import COLUMNS, FOCAL, TIME, PointPixels, camera_jacobian, departure
 from kinefit.solving.bundle.shape import PROPORTIONS, BodyProblem, PixelFrames, ShapeParameters, shape_parameters
-
-Progress = Callable[[str, int, int], None]
 
 _MIN_INLIER_WEIGHT = 0.25  # of the robust loss (Geman-McClure: within its scale)
 _POINT_SIGMA = 0.01  # [m] default of a detector's points about the body's
@@ -143,7 +141,7 @@ def body_model(sighting: PersonSighting, body: Body) -> tuple[ShapeParameters, N
 def spread_frames(sighting: PersonSighting, most: int) -> NDArray:
     """(K,) at most `most` frames with a reliable pose, evenly spaced over the take."""
     good = np.flatnonzero(sighting.motion.quality > _MIN_QUALITY)
-    return good[np.unique(np.linspace(0, len(good) - 1, min(most, len(good))).astype(int))] if len(good) else good
+    return good[spread(len(good), most)]
 
 
 def pixel_frames(sighting: PersonSighting, frames: NDArray) -> PixelFrames:
@@ -410,7 +408,7 @@ def bias(problem: BodyProblem, bundle: Bundle) -> NDArray:
     Quenouille, 1956; J. Tukey, 1958): fit the cameras without the points of each segment in turn.
     """
     frames, state = problem.frames, bundle.state
-    some = np.unique(np.linspace(0, len(frames.uv) - 1, min(_MAX_JACKKNIFE_FRAMES, len(frames.uv))).astype(int))
+    some = spread(len(frames.uv), _MAX_JACKKNIFE_FRAMES)
     owner = frames.points.segments[frames.column]
     groups = np.unique(owner)
 
@@ -428,5 +426,5 @@ def bias(problem: BodyProblem, bundle: Bundle) -> NDArray:
         row = departure(aligned(part.rig, whole.rig)[0], whole.rig)
         row[:, TIME] = part.offsets - whole.offsets
         away.append(row.ravel())
-    spread = np.array(away) - np.mean(away, axis=0)
-    return (len(groups) - 1) / len(groups) * spread.T @ spread
+    deviation = np.array(away) - np.mean(away, axis=0)
+    return (len(groups) - 1) / len(groups) * deviation.T @ deviation

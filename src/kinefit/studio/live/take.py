@@ -30,8 +30,7 @@ from kinefit.studio.live.people import LivePerson, LiveSize
 from kinefit.studio.live.record import SeenRecord
 from kinefit.studio.live.session import LiveSession, Receiver, Source
 from kinefit.takes.missing import find_cameras, last_found
-from kinefit.takes.preparing.detecting import hushed, networks
-from kinefit.takes.preparing.each_video import Tell
+from kinefit.takes.preparing.detecting import Tell, hushed, networks
 from kinefit.takes.preparing.take import warn
 from kinefit.takes.track import settings_of, trial_of, with_bands_of
 

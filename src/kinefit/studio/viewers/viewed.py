@@ -27,7 +27,7 @@ from kinefit.studio.viewers.stage import CameraImages
 from kinefit.takes.batch.corrections import OUTDATED, is_outdated
 from kinefit.takes.batch.results import Step, silent
 from kinefit.takes.missing import find_cameras
-from kinefit.takes.preparing.each_video import Tell
+from kinefit.takes.preparing.detecting import Tell
 from kinefit.takes.preparing.faces import ensure_faces, shown_video
 
 

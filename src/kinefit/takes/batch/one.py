@@ -31,7 +31,7 @@ from kinefit.takes.batch.processes import progress
 from kinefit.takes.batch.summary import DONE, RECORD, Range, Row, failed, write_people_report
 from kinefit.takes.in_view import InView, people_in_view
 from kinefit.takes.missing import last_found, prepared
-from kinefit.takes.preparing.each_video import Tell
+from kinefit.takes.preparing.detecting import Tell
 from kinefit.takes.track import settings_of, track_take
 
 

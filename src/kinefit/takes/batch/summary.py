@@ -14,7 +14,6 @@ from kinefit._pictures import read_picture
 from kinefit.errors import ExportError
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.angles import with_error
-from kinefit.exporters.report.page import Html, finding_callout
 from kinefit.exporters.tables import spoken
 from kinefit.findings import Finding
 
@@ -140,15 +139,15 @@ def summary_page(rows: Sequence[Row], folder: Path) -> str:
     return p.page("Summary of takes", parts)
 
 
-def fault_boxes(rows: Iterable[Row]) -> list[Html]:
+def fault_boxes(rows: Iterable[Row]) -> list[p.Html]:
     """A callout for each fault of the inputs, with its take and person."""
     return [
-        finding_callout(found, f"{row.take}{f', person {row.person}' if row.person else ''}")
+        p.finding_callout(found, f"{row.take}{f', person {row.person}' if row.person else ''}")
         for row in rows for found in row.findings
     ]  # fmt: skip
 
 
-def _takes(rows: Sequence[Row], folder: Path) -> Html:
+def _takes(rows: Sequence[Row], folder: Path) -> p.Html:
 
     cells = [
         (_linked(row, folder, row.take), _person(row), row.subject, row.visit, row.date, row.movement, *outcome(row),
@@ -164,7 +163,7 @@ def outcome(row: Row) -> tuple[str, ...]:
     return row.status, str(row.frames or ""), "" if row.seconds is None else f"{row.seconds:.2f}", quality, lost
 
 
-def by_joint(rows: Sequence[Row]) -> Html:
+def by_joint(rows: Sequence[Row]) -> p.Html:
     """A menu of coordinates, each with tables of ranges by take, and by subject and session."""
     names = list(dict.fromkeys(r.coordinate for row in rows for r in row.ranges))
     pages = {}

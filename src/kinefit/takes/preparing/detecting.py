@@ -1,4 +1,4 @@
-"""The built-in detector over videos: side by side, kept, not done twice."""
+"""The built-in detector over the videos of several cameras at once: side by side, kept, not done twice."""
 
 from __future__ import annotations
 
@@ -6,35 +6,131 @@ import hashlib
 import os
 import shutil
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from glob import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from kinefit._files import regular
+from kinefit._files import regular, writing
 from kinefit._threads import cores
 from kinefit.errors import AssetError, FileError, TakeError
+from kinefit.images.detectors import box_detector
+from kinefit.images.detectors.detection import LOOK_RATE, Adder, detect_people
+from kinefit.images.detectors.faces import FaceFinder, FaceModels, HandFollower, HandModels
+from kinefit.images.detectors.networks import TopDownModels
 from kinefit.observations.detections import WITH_HANDS
-from kinefit.takes.preparing.each_video import Step, Tell, each_video, video_key
+from kinefit.readers.assets import MODELS_CREDIT, MODELS_PACKAGE, detector_models, landmark_models
+from kinefit.readers.landmarks.detections import detections_file, detections_key
+from kinefit.readers.landmarks.networks import description_file, is_blazepose, open_people, open_points
+from kinefit.readers.take.cameras import is_uncalibrated
+from kinefit.readers.take.entries import CameraEntry
+from kinefit.readers.take.file import Take
+from kinefit.readers.videos.video import Video
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+Step = Callable[[str, int, int], None]
+"""Called with what is done, how much of it is done, and how much there is (0: unknown)."""
 
-    from kinefit.images.detectors.box_detector import Models
-    from kinefit.images.detectors.networks import TopDownModels
-    from kinefit.readers.take.entries import CameraEntry
-    from kinefit.readers.take.file import Take
-    from kinefit.readers.videos.video import Video
+Tell = Callable[[str], None]
+"""Called with what is worth saying."""
+
+_ENDS = 2**20  # [bytes] of a video's begin and end by which it is recognised
+J = TypeVar("J")
+
+
+def each_video(jobs: Sequence[J], work: Callable[[J, Step], None], progress: Step | None, *, of: int) -> None:
+    """Do the work on each video, as many at a time as there are cores.
+
+    Parameters
+    ----------
+    work : called with a job and what tells its progress, which raises where another job failed or Ctrl-C came
+    of : how many videos there are, with those that are done already
+
+    Raises
+    ------
+    KeyboardInterrupt
+        With how many are done, which are kept.
+    """
+    stop, lock = threading.Event(), threading.Lock()
+
+    def step(camera: str, done: int, total: int) -> None:
+        if stop.is_set():
+            raise _Stopped
+        if progress:
+            with lock:
+                progress(camera, done, total)
+
+    with _one_thread_each(), ThreadPoolExecutor(min(len(jobs), cores())) as pool:
+        futures = [pool.submit(work, job, step) for job in jobs]
+        try:
+            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
+        except KeyboardInterrupt as stopped:
+            kept = of - len(jobs) + sum(future.done() for future in futures)
+            message = f"{kept} of {of} videos are done. Run the same command to continue with the others."
+            raise KeyboardInterrupt(message) from stopped
+        finally:  # after an error, or Ctrl-C: those that run end at their next picture
+            stop.set()
+            for future in futures:
+                future.cancel()
+    for future in done:
+        future.result()
+
+
+class _Stopped(Exception):
+    """Another camera failed, or Ctrl-C came."""
+
+
+def video_key(path: Path, rate: float | None, method: str) -> str:
+    """Text that another video, or another method, does not have; `rate` [Hz] is that of images in a folder.
+
+    Raises
+    ------
+    FileError
+        The video cannot be read.
+    """
+    from kinefit.readers.videos.video import images_in
+
+    digest, size = hashlib.sha256(), 0
+    images = images_in(path) if path.is_dir() or "*" in path.name else []
+    try:
+        for part in images or [path]:
+            with part.open("rb") as file:
+                length = file.seek(0, os.SEEK_END)
+                for start in (0, max(0, length - _ENDS // max(1, len(images)))):
+                    file.seek(start)
+                    digest.update(file.read(_ENDS // max(1, len(images))))
+            size += length
+    except OSError as error:
+        raise FileError(f"cannot be read ({error.strerror})", file=path, remedy="Check the path.") from error
+    if images:
+        digest.update(f"{len(images)} {rate}".encode())
+    return f"{digest.hexdigest()[:32]} {size} {method}"
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """OpenCV without threads of its own: the cameras run side by side."""
+    import cv2
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
 
 PEOPLE = 3
 """How many people are followed at most in one camera, by default."""
 
-_LARGE = "pose_landmark_heavy.tflite"
-QUALITIES = {"balanced": "pose_landmark_full.tflite", "auto": _LARGE, "best": _LARGE}
+_LARGE_NETWORK = "pose_landmark_heavy.tflite"
+QUALITIES = {"balanced": "pose_landmark_full.tflite", "auto": _LARGE_NETWORK, "best": _LARGE_NETWORK}
 """Landmark networks: the larger, the nearer to the joints, and the slower. "auto" does not look at every image."""
 
 QUALITY = "best"
@@ -126,7 +222,7 @@ class Networks:
         """Whether the landmarks are those of a file of one's own, whatever its kind."""
         return self.name not in QUALITIES
 
-    def models(self, threads: int = 1) -> Models | TopDownModels:
+    def models(self, threads: int = 1) -> box_detector.Models | TopDownModels:
         """The networks, loaded; not to be shared between threads.
 
         Raises
@@ -136,9 +232,6 @@ class Networks:
         FileError, PluginError
             A network that cannot be used.
         """
-        from kinefit.images.detectors import box_detector, networks
-        from kinefit.readers.landmarks.networks import is_blazepose, open_people, open_points
-
         if self.is_own and not is_blazepose(self.landmarks):
             points, layout = open_points(self.landmarks, threads)
             people: Any
@@ -147,16 +240,13 @@ class Networks:
             else:
                 file = self.folder / box_detector.DETECTOR
                 people = box_detector.PersonDetector(box_detector.interpreter(file, threads))
-            return networks.TopDownModels(points, layout, people, mirrored=self.mirrored)
+            return TopDownModels(points, layout, people, mirrored=self.mirrored)
         more = {"people": open_people(self.detector, threads)} if self.detector else {}
         return box_detector.Models(self.folder, threads, self.landmarks, mirrored=self.mirrored, **more)
 
 
 def jobs_of_take(take: Take) -> list[DetectionJob]:
     """Every camera of a take that has a video; TakeError where none has."""
-    from kinefit.readers.landmarks.detections import detections_file
-    from kinefit.readers.take.cameras import is_uncalibrated
-
     rate, clocks_unknown = _rate(take) if take.frames else 0.0, is_uncalibrated(take)
     found = [
         DetectionJob(
@@ -173,8 +263,6 @@ def jobs_of_take(take: Take) -> list[DetectionJob]:
 
 def _rate(take: Take) -> float:
     """Rate [Hz] of a take's steps: its own, or the highest of its videos'."""
-    from kinefit.readers.videos.video import Video
-
     rates = [take.rate or 0.0]
     for camera in take.cameras if take.rate is None else ():
         if camera.video is not None:
@@ -199,8 +287,6 @@ def detect(
 
     Every file is written as soon as its video is done, so that what was interrupted goes on with the others.
     """
-    from kinefit.readers.landmarks.detections import detections_key
-
     keys = {job: detection_key(job) for job in jobs}
     if settings.quality is None:  # what is done anew is done as before
         stored = (detections_key(job.file, "network") for job in jobs)
@@ -244,8 +330,6 @@ def detect(
 
 def _alone(settings: DetectionSettings, before: Path | None) -> Networks | None:
     """Networks of one's own with which no built-in one is used, nor fetched; None for others."""
-    from kinefit.readers.landmarks.networks import is_blazepose
-
     own = settings.quality or before
     if not settings.detector or settings.hands or settings.face or not isinstance(own, Path) or is_blazepose(own):
         return None
@@ -254,9 +338,6 @@ def _alone(settings: DetectionSettings, before: Path | None) -> Networks | None:
 
 def _from_beside(job: DetectionJob, key: str, wanted: Mapping[str, object]) -> None:
     """Copy what another take of the same folder found in the same video already."""
-    from kinefit._files import writing
-    from kinefit.readers.landmarks.detections import detections_key
-
     if _fits(detections_key(job.file), key, wanted, job.seconds):
         return
     for other in sorted(job.file.parent.parent.glob(f"*-detect/{escape(job.file.name)}")):
@@ -279,9 +360,6 @@ def _looks(jobs: Sequence[DetectionJob]) -> dict[DetectionJob, range]:
 
     Empty, so that all are looked at, where the cameras do not take their images together, or that is not known.
     """
-    from kinefit.images.detectors.looking import LOOK_RATE
-    from kinefit.readers.videos.video import Video
-
     rates, firsts = [], []
     for job in jobs:
         with Video(job.video, rate=job.rate) as video:
@@ -297,13 +375,10 @@ def _looks(jobs: Sequence[DetectionJob]) -> dict[DetectionJob, range]:
 def _look_through(
     job: DetectionJob, files: Networks, settings: DetectionSettings, key: str, tell: Step, threads: int
 ) -> None:
-    from kinefit.exporters.motion_file import write_detections
-    from kinefit.images.detectors.detection import detect_people
-    from kinefit.images.detectors.faces import FaceFinder, FaceModels, HandFollower, HandModels
-    from kinefit.readers.videos.video import Video
+
+    from kinefit.exporters.motion_file import write_detections  # all exporters, which take their time to import
 
     models, folder = files.models(threads), files.folder
-    hands = settings.hands and models.layout.keypoint_set in WITH_HANDS
     with Video(job.video, rate=job.rate) as video:
         first, last = seconds_of(job, video)
 
@@ -313,12 +388,14 @@ def _look_through(
                 yield image
             tell(job.camera, last - first, last - first)
 
+        adders: dict[Literal["hands", "face"], Adder] = {}
+        if settings.hands and models.layout.keypoint_set in WITH_HANDS:
+            adders["hands"] = HandFollower(HandModels(folder, threads), layout=models.layout)
+        if settings.face:
+            adders["face"] = FaceFinder(FaceModels(folder, threads), models.layout)
         found = detect_people(
             counted(video.frames(first, last)), models, camera=job.camera, rate=video.rate,
-            people=settings.people or 0, masks=bool(settings.masks),
-            with_hands=HandFollower(HandModels(folder, threads), layout=models.layout) if hands else None,
-            with_faces=FaceFinder(FaceModels(folder, threads), models.layout) if settings.face else None,
-            looks=job.looks,
+            people=settings.people or 0, masks=bool(settings.masks), adders=adders, looks=job.looks,
         )  # fmt: skip
         times = video.times if video.unevenness else None
         found = replace(found.within(first, len(video)), times=times, source=str(job.video))
@@ -333,10 +410,7 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
     Where the large one cannot be fetched, that of "balanced", which comes with the one that finds people, stands in for
     it, and says so.
     """
-    from kinefit.images.detectors.box_detector import LANDMARKS, check_runtime
-    from kinefit.readers.assets import MODELS_CREDIT, detector_models, landmark_models
-
-    check_runtime()
+    box_detector.litert_interpreter()
     fetched: list[int] = []
 
     def report(done: int, total: int) -> None:
@@ -349,19 +423,17 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
     folder = detector_models(report)
     if isinstance(quality, Path):
         return Networks(folder, quality, _name_of(quality))
-    if QUALITIES[quality] == LANDMARKS:
-        return Networks(folder, folder / LANDMARKS, quality)
+    if QUALITIES[quality] == box_detector.LANDMARKS:
+        return Networks(folder, folder / box_detector.LANDMARKS, quality)
     try:
         return Networks(folder, landmark_models(report) / QUALITIES[quality], quality)
     except AssetError as error:
         tell(f"{error} Until then, the network of quality 'balanced' is used.")
-        return Networks(folder, folder / LANDMARKS, "balanced")
+        return Networks(folder, folder / box_detector.LANDMARKS, "balanced")
 
 
 def _name_of(quality: str | Path) -> str:
     """Name that distinguishes results by quality, or by the network's file and the one that describes it."""
-    from kinefit.readers.landmarks.networks import description_file
-
     if isinstance(quality, str):
         return quality
     try:
@@ -376,8 +448,6 @@ def _name_of(quality: str | Path) -> str:
 
 def detection_key(job: DetectionJob) -> str:
     """Begin of the key of a video's detections: text that another video, or another detector, does not have."""
-    from kinefit.readers.assets import MODELS_PACKAGE
-
     return video_key(job.video, job.rate, f"{MODELS_PACKAGE} {_METHOD}")
 
 

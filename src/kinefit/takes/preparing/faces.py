@@ -1,4 +1,4 @@
-"""Heads in the videos of a take, found once and kept beside it, and the videos with all faces hidden.
+"""Heads in the videos of a take, found once and kept beside it, and the videos, or copies, with all faces hidden.
 
 The file, TAKE-detect/CAMERA-faces.npz, is a compressed archive of numpy arrays: `searched` and `searched_small` (N,),
 frames that were looked through for heads of any and of small size; `found` (M, 5) frame, u, v, radius [px], and 1 for
@@ -7,24 +7,28 @@ those of the search for small ones; `key`, which another video does not have.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import read_npz
+from kinefit._files import read_npz, write_text, writing
 from kinefit._threads import cores
-from kinefit.errors import FileError
+from kinefit.errors import FileError, TakeError
+from kinefit.images.detectors.faces import FaceDetector, head_circles
+from kinefit.images.detectors.layouts import HEAD_POINTS
+from kinefit.observations import Detections
+from kinefit.readers.assets import MODELS_PACKAGE
+from kinefit.readers.landmarks.detections import detections_key, read_detections
+from kinefit.readers.take.file import Take, read_take
+from kinefit.readers.take.load import Observations
 from kinefit.readers.videos.video import Video
-from kinefit.takes.preparing.detecting import DetectionJob, jobs_of_take, networks, seconds_of
-from kinefit.takes.preparing.each_video import Step, Tell, each_video, video_key
-
-if TYPE_CHECKING:
-    from kinefit.readers.take.file import Take
-    from kinefit.readers.take.load import Observations
+from kinefit.takes.preparing import detecting
+from kinefit.takes.preparing.detecting import DetectionJob, Step, Tell, jobs_of_take, networks, seconds_of
+from kinefit.takes.preparing.take import with_detections
 
 _METHOD = "faces 1"  # raise it when other circles are found in the same video
 _STEP, _SMALL_STEP = 0.1, 0.4  # [s] between frames that are searched; for small heads, which move by few pixels
@@ -116,21 +120,22 @@ def shown_video(take: Take, seen: Observations, camera: str, *, find: bool = Tru
     offset = next(entry.time_offset for entry in take.cameras if entry.name == camera)
 
     def of_keypoints(frame: int) -> NDArray:
-        from kinefit.images.detectors.faces import head_circles
-        from kinefit.images.detectors.layouts import HEAD_POINTS
-
         circles = [np.zeros((0, 3))]
         for keypoints in seen.keypoints:
             if keypoints.camera == camera:
-                named = [k for k, name in enumerate(keypoints.names) if HEAD_POINTS.search(name.lower())]
                 at = round((video.times[frame] + offset - keypoints.time_offset) * keypoints.rate)
-                near = keypoints.points[max(at - 1, 0) : max(at + 2, 0), :, named]
-                uv = seen.images[camera].from_calibration(near)
-                circles += [head_circles(uv.reshape(-1, len(named), 2))] if named else []
+                uv = seen.images[camera].from_calibration(keypoints.points[max(at - 1, 0) : max(at + 2, 0)])
+                circles.append(_heads_of(keypoints.names, uv.reshape(-1, *uv.shape[2:])))
         return np.concatenate(circles)
 
     video = HiddenVideo(path, heads, rate=seen.rate, more=of_keypoints)
     return video
+
+
+def _heads_of(names: Sequence[str], points: NDArray) -> NDArray:
+    """Circles (N, 3) u, v, radius [px] around the heads of people, by their points (P, K, 2) [px] of these names."""
+    named = [k for k, name in enumerate(names) if HEAD_POINTS.search(name.lower())]
+    return head_circles(points[:, named]) if named else np.zeros((0, 3))
 
 
 def ensure_faces(
@@ -148,29 +153,24 @@ def ensure_faces(
     AssetError, FileError, ExportError
         What fetching the networks, reading a video and writing the file raise.
     """
-    from kinefit.readers.assets import MODELS_PACKAGE
-
     chosen = [job for job in jobs_of_take(take) if cameras is None or job.camera in cameras]
     jobs = {job: _seconds_key(job, f"{MODELS_PACKAGE} {_METHOD}") for job in chosen}
     todo = [job for job, key in jobs.items() if find and _read(_file(job), key) is None]
     if todo:
-        from kinefit.images.detectors.faces import FaceDetector
-        from kinefit.takes.preparing.detecting import hushed
-
         folder, threads = networks(progress, tell).folder, max(cores() // len(todo), 1)
 
         def work(job: DetectionJob, step: Step) -> None:
             _write(find_faces(job, threads=threads, folder=folder, step=step), _file(job), jobs[job])
 
-        with hushed():
+        with detecting.hushed():
             FaceDetector(folder)
-        each_video(todo, work, progress, of=len(jobs))
+        detecting.each_video(todo, work, progress, of=len(jobs))
     found = {job.camera: _read(_file(job), key) for job, key in jobs.items()}
     return {camera: heads for camera, heads in found.items() if heads is not None}
 
 
 def _seconds_key(job: DetectionJob, method: str) -> str:
-    return video_key(job.video, job.rate, f"{method} {job.seconds or ''}")
+    return detecting.video_key(job.video, job.rate, f"{method} {job.seconds or ''}")
 
 
 def _file(job: DetectionJob) -> Path:
@@ -179,8 +179,6 @@ def _file(job: DetectionJob) -> Path:
 
 def find_faces(job: DetectionJob, *, threads: int = 1, folder: Path | None = None, step: Step | None = None) -> Heads:
     """Look through the frames of a video that a take uses; `folder` is that of the networks."""
-    from kinefit.images.detectors.faces import FaceDetector
-
     detect = FaceDetector(folder or networks(None, lambda text: None).folder, threads)
     with Video(job.video, rate=job.rate) as video:
         first, last = seconds_of(job, video)
@@ -203,8 +201,6 @@ def _grid(first: int, last: int, every: float) -> list[int]:
 
 
 def _write(heads: Heads, path: Path, key: str) -> None:
-    from kinefit._files import writing
-
     with writing(path) as temporary:
         np.savez_compressed(
             temporary, key=np.array(key), searched=heads.searched, searched_small=heads.searched_small,
@@ -221,3 +217,66 @@ def _read(path: Path, key: str) -> Heads | None:
         return Heads(arrays["searched"], arrays["searched_small"], arrays["found"].astype(float))
     except (FileError, KeyError, ValueError):
         return None
+
+
+_VIDEO = re.compile(r'^video = "[^"\n]*"', re.M)
+FOLDER = "hidden-faces"
+"""Beside the take file: where the copies lie."""
+
+
+def hide_in_copies(path: Path, progress: Step | None, tell: Tell) -> list[Path]:
+    """Write copies of a take's videos with all faces hidden, and let the take file name these; returns them.
+
+    Keypoints are detected in the videos themselves before, where the take has none, and kept as those of the copies.
+
+    Raises
+    ------
+    TakeError
+        A video is not a file, or has an odd number of rows or columns.
+    KinefitError
+        As `ensure_faces`, `with_detections`.
+    """
+    from kinefit.exporters.motion_file import write_detections
+    from kinefit.exporters.pictures.overlay import write_pictures
+
+    take = replace(read_take(path), hide_faces=True)
+    jobs = jobs_of_take(take)
+    _check(take)
+    with_detections(take, progress, tell)
+    heads, copies = ensure_faces(take, progress, tell), dict[str, Path]()
+    for job in jobs:
+        copies[job.camera] = path.parent / FOLDER / f"{job.file.stem}.mp4"
+        key = detections_key(job.file)
+        found = read_detections(job.file) if key is not None else None
+
+        def of_people(frame: int, found: Detections | None = found) -> NDArray:
+            return _heads_of(found.names, found.points[frame]) if found else np.zeros((0, 3))
+
+        def shown(video: Video, camera: str = job.camera) -> Iterator[NDArray[np.uint8]]:
+            for frame, image in enumerate(video.frames()):
+                if progress:
+                    progress(f"hiding {camera}", frame + 1, len(video))
+                yield image
+
+        with HiddenVideo(job.video, heads[job.camera], rate=job.rate, more=of_people) as video:
+            write_pictures(shown(video), copies[job.camera], video.rate, video.size, times=video.times)
+        if found is not None and key is not None:
+            own, of_copy = detecting.detection_key(job), detecting.detection_key(replace(job, video=copies[job.camera]))
+            write_detections(found, job.file, key=key.replace(own, of_copy, 1))
+    names = iter([f"{FOLDER}/{copies[camera.name].name}" for camera in take.cameras if camera.video is not None])
+    write_text(path, _VIDEO.sub(lambda line: f'video = "{next(names)}"', path.read_text("utf-8")))
+    return list(copies.values())
+
+
+def _check(take: Take) -> None:
+    """Refuse videos that cannot be copied as they are."""
+    for camera in take.cameras:
+        if camera.video is not None and not camera.video.is_file():
+            problem = "--hide-faces copies only video files, not images in folders or recordings"
+            remedy = "Convert them to videos first."
+            raise TakeError(problem, file=take.path, place=f"camera {camera.name}", remedy=remedy)
+        if camera.video is not None:
+            with Video(camera.video) as video:
+                if video.size[0] % 2 or video.size[1] % 2:
+                    problem = f"the video has {video.size[0]} x {video.size[1]} px; copies need even numbers"
+                    raise TakeError(problem, file=camera.video, remedy="Set hide_faces = true in [take] instead.")

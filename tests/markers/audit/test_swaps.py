@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kinefit.geometry.se3 import exp_so3
-from kinefit.markers.audit.gaps import _ExpectedPlaces, _leaves, _nearest, _spans, find_swaps_in_gaps
+from kinefit.markers.audit.swaps import _ExpectedPlaces, _leaves, _nearest, _spans, gap_swaps
 
 
 def _cluster(frames=120, count=8, seed=0):
@@ -50,9 +50,9 @@ def test_ends_of_long_trajectories_are_looked_at_only_where_they_leap():
     leapt[-1, 3] = x[-1, 5]
     leapt[-1, 5] = np.nan
     assert (3, 199, 199) in _spans(leapt, 0.02)
-    assert find_swaps_in_gaps(leapt, mean, deviation) == [(3, 5, 199, 199)]
+    assert gap_swaps(leapt, mean, deviation) == [(3, 5, 199, 199)]
     first = leapt[::-1]
-    assert find_swaps_in_gaps(np.ascontiguousarray(first), mean, deviation) == [(3, 5, 0, 0)]
+    assert gap_swaps(np.ascontiguousarray(first), mean, deviation) == [(3, 5, 0, 0)]
     short = np.array(x[:60])
     short[20:, 3] = np.nan
     assert (3, 18, 19) in _spans(short, 0.02)  # of twenty frames: it may be another's as a whole

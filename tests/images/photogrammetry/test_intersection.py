@@ -7,7 +7,7 @@ from tests.images.photogrammetry import scenes
 
 from kinefit.bodies.surfaces.places import nearest
 from kinefit.geometry.camera import Rig
-from kinefit.images.photogrammetry.points.one_camera import at_range, body_ranges, flat_camera, plane_ranges
+from kinefit.images.photogrammetry.intersection import at_range, body_ranges, flat_camera, plane_ranges
 from kinefit.images.photogrammetry.spline_image import SplineImage
 from kinefit.images.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
 

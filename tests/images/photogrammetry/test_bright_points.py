@@ -6,8 +6,8 @@ import pytest
 from tests.images.photogrammetry import scenes
 
 from kinefit.geometry.camera import Rig
-from kinefit.images.photogrammetry.points.bright_points import BrightPointTracker, find_spots, nearest_spots
-from kinefit.images.photogrammetry.points.one_camera import flat_camera
+from kinefit.images.photogrammetry.bright_points import BrightPointTracker, find_spots, nearest_spots
+from kinefit.images.photogrammetry.intersection import flat_camera
 from kinefit.images.photogrammetry.spline_image import SplineImage
 from kinefit.images.photogrammetry.surface_tracking import SurfaceTracking
 

@@ -1,1 +1,0 @@
-"""Bright points, and points of one camera."""
