@@ -73,14 +73,12 @@ def sensors(told: Told) -> None:
 
 
 def intervals(told: Told) -> None:
-    """Print how often the truth lies inside the stated 95 % interval, and how much is stated."""
+    """Print how often the truth lies inside the stated 95 % interval."""
     cells: dict[tuple[str, str], dict[Run, NDArray]] = {}  # (group, what): run: (draws, 2) inside, all
     missing = [run for run in told if _of(told, run)[1]]
     for run in told:
-        outcomes, reason = _of(told, run)
-        for key, counts in _counts(told[run] if outcomes else []).items():
+        for key, counts in _counts(told[run] if _of(told, run)[0] else []).items():
             cells.setdefault(key, {})[run] = counts
-        _stated("_".join(run), outcomes, reason)
     share = lambda rows: rows[:, 0].sum() / max(rows[:, 1].sum(), 1.0)
     whole = f"{len(missing)} runs failed, first {' '.join(missing[0])}: {_of(told, missing[0])[1]}" if missing else ""
     for what in ("joints", "angles"):
@@ -142,23 +140,6 @@ def smoothing(told: Told) -> None:
         whole, behind, reason = _both(told, (mix, "smoothed"), (mix, "lag"))
         ratio = [b.passing / a.passing for a, b in zip(whole, behind)]
         figure(f"fixed_lag_error_{mix}", _mean(ratio) if ratio else None, "x", "<= 1.15", reason)
-
-
-def _stated(name: str, outcomes: Sequence[Outcome], reason: str) -> None:
-    """Share of what is observable that has a finite sigma, and sigma as a multiple of the error."""
-    for what, sigma_of, error_of, seen_of in (
-        ("joints", lambda o: o.sigma, lambda o: o.shift, lambda o: o.seen),
-        ("angles", lambda o: o.turn_sigma, lambda o: o.turn, lambda o: o.seen_turn),
-    ):
-        shares, sigmas, errors = [], [], []
-        for o in outcomes:
-            finite, seen = np.isfinite(sigma_of(o)), seen_of(o) >= 0.5
-            shares.append(finite[:, seen].mean())
-            sigmas.append(sigma_of(o)[finite].mean() if finite.any() else np.nan)
-            errors.append(np.sqrt(np.mean(np.square(error_of(o)[finite]))) if finite.any() else np.nan)
-        figure(f"finite_{what}_{name}", 100 * _mean(shares), "% of what is observable", ">= 90", reason)
-        rms = float(np.sqrt(_mean(np.square(errors)))) if errors else np.nan
-        figure(f"sigma_{what}_{name}", _mean(sigmas) / rms if errors else None, "x rms error", "<= 1.5", reason)
 
 
 def _counts(outcomes: Sequence[Outcome | str | None]) -> dict[tuple[str, str], NDArray]:
