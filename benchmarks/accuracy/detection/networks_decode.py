@@ -17,8 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import NotMeasured, amount, figure
-from kinefit.errors import ObservationError
-from kinefit.images.detectors.networks import onnx_runtime
 from kinefit.images.detectors.roi import Roi
 from kinefit.readers.landmarks.networks import open_points
 
@@ -30,9 +28,8 @@ _GFLOPS = 1.9  # of RTMPose-m
 def run() -> None:
     """Print the figures."""
     try:
-        onnx_runtime()
         from benchmarks.accuracy.detection.onnx_networks import heatmap_network, simcc_network
-    except (ObservationError, ImportError) as error:
+    except ImportError as error:
         raise NotMeasured(f"no onnxruntime ({error})") from error
     with tempfile.TemporaryDirectory() as folder:
         for name, make, decode in (("simcc", simcc_network, _simcc), ("heatmaps", heatmap_network, _heatmaps)):
@@ -43,8 +40,10 @@ def run() -> None:
 
 def _difference(file: Path, decode: Callable[[list[NDArray]], NDArray]) -> float:
     """Largest distance [px] of kinefit's points in an image from the published ones."""
+    import onnxruntime
+
     find, layout = open_points(file)
-    session = onnx_runtime().InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     rng, worst = np.random.default_rng(0), 0.0
     for _ in range(amount(40, 4)):
         noise = rng.integers(0, 256, (24, 32, 3), np.uint8)
@@ -121,10 +120,12 @@ def _large(file: Path, name: str) -> Path:
 
 def _cost(file: Path) -> float:
     """What kinefit adds to a network's run: crop, input and decoding, as a share of it; medians of pairs."""
+    import onnxruntime
+
     find, layout = open_points(file)
-    options = onnx_runtime().SessionOptions()
+    options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    session = onnx_runtime().InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
     rng = np.random.default_rng(2)
     image = rng.integers(0, 256, (1080, 1920, 3), np.uint8)
     values = rng.normal(size=(1, 3, _SIZE[1], _SIZE[0])).astype(np.float32)

@@ -4,7 +4,8 @@ Pixels below were read from the images, to about 5 px: middle of the hand, betwe
 longer narrows) and the knuckles (2 cm nearer than where stretched fingers part, 1 cm from a fist's end), and the lower
 end of a raised forearm. A hand lies 1.5 cm behind the surface that is seen there, an elbow 4 cm. A fist that points to
 the camera (the forearm is seen beside it, 10 to 30 cm farther off, or hidden by it) shows its knuckles: the middle of
-the hand lies half of the 9 cm from there to the wrist behind them, and 1 cm of flesh. Nothing was fitted to them. Two people are in the first and the last image of the Kinect: the nearer counts.
+the hand lies half of the 9 cm from there to the wrist behind them, and 1 cm of flesh. Nothing was fitted to them. Two
+people are in the first and the last image of the Kinect: the nearer counts.
 """
 
 from __future__ import annotations

@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.closures.closures_people import gap, joints, left, own_circle, rms, true_circle
-from benchmarks.accuracy.closures.closures_takes import Take
+from benchmarks.accuracy.closures.closures_people import gap, joints, left, own_circle, rms
 from benchmarks.figures import LEFT_OUT, ROOT, amount, figure, quick
 from benchmarks.papers.regions.gear_takes import GearTake, rendered_cyclist, rendered_snowboarder
 from benchmarks.scenes.curves import COLOURS, curves
@@ -110,14 +109,7 @@ def pedals(whole: Sequence[Followed], hidden: Sequence[Followed]) -> None:
     """How far both cleats' paths are from circles."""
     for key, takes in _kinds(whole, hidden):
         figure(f"cyclist_regions{key}_pedal", rms([own_circle(f.closed) for f in takes]), "mm RMS", "<= 2")
-        worlds = [rms([true_circle(_as_take(f), m) for f, m in pairs]) for pairs in (
-            [(f, f.closed) for f in takes], [(f, f.loose) for f in takes])]  # fmt: skip
-        print(f"  without closures: {rms([own_circle(f.loose) for f in takes]):.1f} mm; from the true circle "
-              f"{worlds[0]:.1f} mm with closures, {worlds[1]:.1f} mm without")  # fmt: skip
-
-
-def _as_take(f: Followed) -> Take:
-    return Take(f.take.truth, f.take.truth.body, None, f.take.hidden)  # type: ignore[arg-type]
+        print(f"  without closures: {rms([own_circle(f.loose) for f in takes]):.1f} mm")
 
 
 def boots(whole: Sequence[Followed], hidden: Sequence[Followed]) -> None:
