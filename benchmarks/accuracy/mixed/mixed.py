@@ -71,7 +71,6 @@ def main(words: Sequence[str]) -> None:
         which = range(told.first, told.first + draws)
         outcomes = track_draws(which, frames, runs, told.each, told.workers)
         print(f"# {draws} draws, {told.each or len(runs)} takes of each, {time.perf_counter() - begin:.0f} s")
-        mixed_figures.table(outcomes)
         for group in simulated:
             print(f"\n# {group}", flush=True)
             SIMULATED[group](outcomes)

@@ -34,24 +34,6 @@ SAMPLES, FEWEST, SIGMAS = 2000, 200, 1.96
 NOISE = 0.3  # [m/s²] that no smoothing need improve
 
 
-def table(told: Told) -> None:
-    """Print errors, stated deviations and time of every run, and what failed in which way."""
-    for run, draws in told.items():
-        kept = [one for one in draws if isinstance(one, Outcome)]
-        reasons = sorted({one for one in draws if isinstance(one, str)})
-        text = f"# {' '.join(run)}: {len(kept)} of {sum(one is not None for one in draws)} draws"
-        if kept:
-            known = lambda array: array[np.isfinite(array)]
-            sigma = 1e3 * _mean([_mean(known(o.sigma)) for o in kept])
-            text += (
-                f", joints {1e3 * _mean([o.distance.mean() for o in kept]):.1f} mm (median draw "
-                f"{1e3 * np.median([o.distance.mean() for o in kept]):.1f}), sigma {sigma:.1f} mm, angles "
-                f"{_mean([np.degrees(np.abs(o.turn).mean()) for o in kept]):.1f} deg, "
-                f"{_mean([o.seconds for o in kept]):.1f} s"
-            )
-        print("; ".join([text, *reasons]), flush=True)
-
-
 def sensors(told: Told) -> None:
     """Print what each sensor adds."""
     for less, more in PAIRS:
@@ -89,19 +71,11 @@ def intervals(told: Told) -> None:
                 figure(f"inside_{what}_{group}_least", 100 * value, "%", ">= 90", whole)
                 figure(f"inside_{what}_{group}_most", 100 * value, "%", "<= 98", whole)
         single = [
-            (100 * share(counts), run, group, counts) for (group, kind), runs in cells.items() if kind == what
-            for run, counts in runs.items() if counts[:, 1].sum() >= FEWEST
+            100 * share(counts) for (_, kind), runs in cells.items() if kind == what
+            for counts in runs.values() if counts[:, 1].sum() >= FEWEST
         ]  # fmt: skip
-        single.sort(key=lambda cell: cell[0])
-        for value, run, group, counts in [*single[:3], *single[3:][-3:]]:
-            low, _, high = _interval(share, counts, sides=2)
-            print(f"# {what} {' '.join(run)} {group}: {value:.1f} % ({100 * low:.1f} to {100 * high:.1f})")
-        figure(f"inside_{what}_lowest_cell", single[0][0] if single else None, "%", ">= 85", whole)
-        figure(f"inside_{what}_highest_cell", single[-1][0] if single else None, "%", "<= 99.5", whole)
-        for run in told:
-            own = [runs[run] for (_, kind), runs in cells.items() if kind == what and run in runs]
-            if own:
-                print(f"# {what} {' '.join(run)}: {100 * share(np.concatenate(own)):.1f} % inside")
+        figure(f"inside_{what}_lowest_cell", min(single, default=None), "%", ">= 85", whole)
+        figure(f"inside_{what}_highest_cell", max(single, default=None), "%", "<= 99.5", whole)
     figure("runs_that_failed", float(len(missing)), "runs", "== 0")
     if missing:
         print(f"# {whole}")
