@@ -186,9 +186,11 @@ def depth_images(bare: SimulatedScene, front: Camera, draw: int) -> tuple[NDArra
     return video, _counts(simulate_depth(gone.motion, front, SENSOR, seed=draw + 10_000, scene=gone), EMPTY)
 
 
-def detected(truth: Motion, rig: Rig, draw: int, outliers: float = 0.1) -> NDArray:
+def detected(
+    truth: Motion, rig: Rig, draw: int, outliers: float = 0.1, cameras: Sequence[str] = CAMERAS
+) -> NDArray:
     """(C, F, 33, 3) points and visibility, as MediaPipe gives them."""
-    chosen = Rig(tuple(rig[name] for name in CAMERAS))
+    chosen = Rig(tuple(rig[name] for name in cameras))
     seen = simulate_keypoints(truth, chosen, DETECTOR, drift_px=2.0, outliers=outliers, seed=draw)
     return np.array([rows_of(k) for k in seen]).astype(np.float32)
 
