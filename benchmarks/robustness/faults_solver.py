@@ -1,4 +1,4 @@
-"""The marker solver on long takes with limits active: a second call on its own result must win nothing."""
+"""The marker solver on a long take with limits active: a second call on its own result must win nothing."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.solving.trajectory.sequence import fit_sequence
 
 SETTINGS: dict[str, dict[str, Any]] = {"squared": {"loss": SQUARED}, "robust": {"loss": MARKER_LOSS, "posture": 1.0}}
-"""Losses of the simulated take; the second is what `fit_markers` takes."""
+"""Losses; the second is what `fit_markers` takes."""
 
 MAX_GAIN = 1e-4
 """Share of a frame's cost that a second call may win: a hundred times the tolerance at which a frame ends."""
@@ -29,24 +29,10 @@ GRAVITY = 9.81
 
 
 def run() -> None:
-    """Print the figures of the marker solver's faults."""
-    body, points, x = beyond_limits(amount(1200, 400))
-    count = 0
-    for name, settings in SETTINGS.items():
-        found = fit_sequence(body, body.default_state(), points, x, **settings)
-        active = np.mean((found.angles <= body.tree.lower) | (found.angles >= body.tree.upper))
-        gain = second_call(body, points, x, found.Ts_world_root, found.angles, **settings)
-        count += int(np.sum(gain > MAX_GAIN))
-        print(
-            f"# simulated, {name} loss: {len(x)} frames, {100 * active:.0f} % of angles at a limit, "
-            f"{found.iterations.mean():.1f} steps a frame, a second call wins {gain.max():.1e} at most"
-        )
-    figure("faults_solver_second_call_simulated", count, "frames", "== 0")
-    squats()
+    """Print the figures of 1,346 frames of squats without gaps.
 
-
-def squats() -> None:
-    """1,346 frames of squats without gaps: the subject from this trial and a static one, as `kinefit markers fit`."""
+    The subject is fitted to this trial and a static one, as `kinefit markers fit` does.
+    """
     folder = recording("forces_nimblephysics")
     static, take = (read_markers(folder / "subject4" / f"{name}.trc") for name in ("static1", "squats1"))
     subject = fit_marker_subject(load_body("humanoid"), [static, take])

@@ -1,4 +1,4 @@
-"""Many takes: how much faster two workers are, what a scheduler costs, whether a killed run ends as one that was not.
+"""Many takes: how much faster two workers are, what a scheduler costs.
 
 Takes are simulated as those of `long`. Speed is of the whole command, workers' start included; on a machine
 that does something else besides, it is not measured. The scheduler of Dask gets takes that take no time, on two workers
@@ -8,20 +8,18 @@ of this machine.
 from __future__ import annotations
 
 import os
-import shutil
-import signal
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.commands import begun, used
+from benchmarks.commands import used
 from benchmarks.figures import NotMeasured, amount, figure
 from benchmarks.speed.long import write_long_take
 from kinefit.takes.batch.one import Choices, TakeJob
 from kinefit.takes.batch.processes import run_there
-from kinefit.takes.batch.summary import RECORD, Row
+from kinefit.takes.batch.summary import Row
 
 TAKES = 10_000
 """Takes that the scheduler of Dask gets."""
@@ -39,7 +37,6 @@ def run() -> None:
         for k in range(amount(8, 2)):
             write_long_take(folder / "sessions" / f"s{k:02d}", amount(600, 30), seed=10_000 * k)
         speed(folder)
-        figure("batch_resume_equal", resumed(folder), "of 1", "== 1")
     overhead(amount(TAKES, 200))
 
 
@@ -56,38 +53,6 @@ def speed(folder: Path) -> None:
     if cores < 2 or load > BUSY:
         ratio, reason = None, f"{cores} cores, and {load:.1f} processes ran on them before"
     figure("batch_two_workers", ratio, "times as fast", ">= 1.9", reason)
-
-
-def resumed(folder: Path) -> float:
-    """1 where one worker, two, and a run that was killed and gone on with leave the same files, bit for bit."""
-    one, two = (contents(folder / f"out-{workers}") for workers in (1, 2))
-    process = begun(*_words(folder, "killed", 2))
-    while process.poll() is None and not list((folder / "killed").rglob(RECORD)):
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    done = {path: path.stat().st_mtime_ns for path in (folder / "killed").rglob(RECORD)}
-    unfinished = len(list((folder / "killed").rglob("unfinished")))
-    time.sleep(1.0)  # its workers end
-    used(*_words(folder, "killed", 2))
-    kept = all(path.stat().st_mtime_ns == time_ns for path, time_ns in done.items())
-    takes = len(list((folder / "sessions").iterdir()))
-    print(f"  killed after {len(done)} of {takes} takes, {unfinished} unfinished; those done were kept: {kept}")
-    same = one == two == contents(folder / "killed") and kept and 0 < len(done) < takes
-    shutil.rmtree(folder / "killed")
-    return float(same)
-
-
-def contents(out: Path) -> dict[Path, object]:
-    """All that a batch leaves, arrays in place of archives, which hold the time of their writing."""
-    found: dict[Path, object] = {}
-    for path in sorted(out.rglob("*")):
-        if path.suffix == ".npz":
-            with np.load(path) as arrays:
-                found[path.relative_to(out)] = {name: arrays[name].tobytes() for name in arrays.files}
-        elif path.is_file() and path.name != RECORD:
-            found[path.relative_to(out)] = path.read_bytes()
-    return found
 
 
 def overhead(takes: int) -> None:

@@ -76,7 +76,7 @@ def test_the_clock_goes_into_every_file_and_back(tmp_path, given, first):
 
 
 def test_a_row_never_ends_in_an_empty_cell(tmp_path):
-    """OpenSim refuses one: `python -m benchmarks faults faults_users` writes such gaps."""
+    """OpenSim refuses one."""
     x = np.ones((4, 3, 3))
     x[0, 2] = x[1, :] = x[2, 1] = np.nan
     write_markers(Markers(("A", "B", "C"), 100.0, x), tmp_path / "a.trc", unit="m")

@@ -379,7 +379,11 @@ def of_header(changes, *, points=PLACES, groups=None, first=1, **more):
 
 REFUSED_C3D = {
     "header's rate is 60 Hz, POINT:RATE is 100 Hz": of_header({20: 60.0}),
+    "header's rate is 100 Hz, POINT:RATE is 120 Hz": of_header(
+        {}, groups={"POINT": {"RATE": np.array(120, np.float32)}}
+    ),
     "header's scale is 0.1, POINT:SCALE is -1 ": of_header({12: 0.1}),
+    "POINT:SCALE is 0.05": of_header({}, groups={"POINT": {"SCALE": np.array(0.05, np.float32)}}),
     "8 analog values a frame from block.*fits none": of_header({4: 8}, groups=SEVEN, analog=ANALOG, samples=5),
 }
 

@@ -1,9 +1,11 @@
 """Recorded motions on the humanoid."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tests.readers.skeletons.bvh_variants import along, any_frames, turned, write_variant
 
 from kinefit.bodies import load_body
@@ -18,6 +20,7 @@ from kinefit.readers.skeletons.bvh import read_bvh
 from kinefit.simulation import cut, resampled, retarget, squat_and_wave
 from kinefit.simulation.skeletons import bone_directions
 
+Z_UP, Y_DOWN = (Rotation.from_euler("x", angle, degrees=True).as_matrix() for angle in (90, 180))
 BONES = {"thigh": "shank", "shank": "foot", "foot": "toes", "upperarm": "forearm", "forearm": "hand"}
 RECORDINGS = [  # file, family, frames, largest median and 95th percentile of the error [deg]
     ("motion_cmu_bvh/cmu_12_01_walk.bvh", "MotionBuilder (CMU)", 262, 1.0, 3.0),
@@ -215,6 +218,52 @@ def test_joint_frames_and_the_rest_pose_do_not_matter(walk, tmp_path, frames, of
     neck, others = turn(found, motion)
     assert others < 0.1 and neck < 2.0  # the head of the first frame is 1.7 degrees off that of the rest pose
     assert not of_provenance(found.provenance)
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "options"),
+    [
+        ("motion_cmu_bvh/cmu_12_01_walk.bvh", lambda s: along(s, 2), {"world": Z_UP}),
+        ("motion_cmu_bvh/cmu_12_01_walk.bvh", lambda s: turned(s, 0, 0, 90), {"world": Y_DOWN}),
+        ("motion_animateddrawings_bvh/wave_hello.bvh", lambda s: turned(s, 30, 40, 20), {"world": Z_UP}),
+        ("motion_cmu_bvh/007_04.bvh", any_frames, {}),  # with eyes and fingers
+    ],
+)
+def test_worlds_and_skeletons_do_not_matter(data_dir, tmp_path, name, frames, options):
+    skeleton = some_frames(read(data_dir, name))
+    right, other = (tmp_path / f"{name}.bvh" for name in ("right", "other"))
+    motion = retarget(read_bvh(write_variant(skeleton, right, turned(skeleton, 0, 0, 0))))
+    found = retarget(read_bvh(write_variant(skeleton, other, frames(skeleton), **options)))
+    neck, others = turn(found, motion)
+    assert others < 1.0 and neck < 2.0
+
+
+def test_an_asf_may_lie_on_its_back(data_dir, tmp_path):
+    """Axes and directions of the skeleton and the root's angles of the motion, all turned by the same."""
+    place, back = data_dir("motion_cmu_amc"), Rotation.from_euler("x", 90, degrees=True)
+
+    def of_axes(found):
+        R = back * Rotation.from_euler("xyz", np.array(found[1].split(), float), degrees=True)
+        return "axis " + " ".join(f"{v:.8f}" for v in R.as_euler("xyz", degrees=True)) + " XYZ"
+
+    def of_root(found):
+        values = np.array(found[1].split(), float)
+        R = Rotation.from_euler("xyz", values[3:], degrees=True) * back.inv()
+        return "root " + " ".join(f"{v:.8f}" for v in (*values[:3], *R.as_euler("xyz", degrees=True)))
+
+    amc, asf = (place / "02_01.amc").read_text().partition("\n2\n")[0], (place / "02.asf").read_text()
+    lying = re.sub(r"direction +(\S+ +\S+ +\S+)", lambda found: "direction " + " ".join(
+        f"{v:.8f}" for v in back.apply(np.array(found[1].split(), float))), asf)  # fmt: skip
+    motions = []
+    for name, skeleton, frames in (
+        ("right", asf, amc), ("lying", re.sub(r"axis +(\S+ +\S+ +\S+) +XYZ", of_axes, lying),
+                              re.sub(r"root +(.*)", of_root, amc)),
+    ):  # fmt: skip
+        (tmp_path / f"{name}.asf").write_text(skeleton)
+        (tmp_path / f"{name}.amc").write_text(frames + "\n")
+        motions.append(read_amc(tmp_path / f"{name}.asf", tmp_path / f"{name}.amc"))
+    np.testing.assert_allclose(motions[0].positions, motions[1].positions, atol=1e-5)
+    assert max(turn(*map(retarget, motions))) < 1.0
 
 
 def test_offsets_of_zero(walk, tmp_path):

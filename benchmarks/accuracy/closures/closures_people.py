@@ -79,8 +79,6 @@ def pedals(whole, hidden) -> None:
         closed, loose = ([own_circle(m[k]) for _, *m in takes] for k in (0, 1))
         figure(f"cyclist, {what}: RMS deviation from its circle", rms(closed), "mm", "<= 2")
         print(f"  without closures: {rms(loose):.1f} mm, worst {max(float(c.max()) for c in loose):.1f} mm")
-        closed, loose = ([true_circle(t, m[k]) for t, *m in takes] for k in (0, 1))
-        print(f"  from the true circle in the world: {rms(closed):.1f} mm with closures, {rms(loose):.1f} mm without")
 
 
 def rms(parts) -> float:
@@ -100,22 +98,6 @@ def own_circle(motion: Motion) -> NDArray:
         found = least_squares(fit, [0.0, 0.0, 0.17]).x
         out.append(1e3 * np.hypot(fit(found), w))
     return np.stack(out, axis=1)
-
-
-def true_circle(take: Take, motion: Motion) -> NDArray:
-    """(F, 2) [mm] of both cleats from the circles about the true crank's axis."""
-    truth = take.truth
-    names = ("r_cleat", "l_cleat")
-    points, centres = motion.body.landmarks.select(names), truth.body.landmarks.select(("crank_axis",))
-    x = motion.positions(points)
-    centre = truth.positions(centres)[0, 0]
-    axis = truth.segment_poses()[0, truth.body.tree.segment("bike"), :3, :3] @ [0.0, 0.0, 1.0]
-    own = truth.positions(truth.body.landmarks.select(("right_pedal_centre", "left_pedal_centre")))
-    height = ((own - centre) @ axis).mean(axis=0)
-    radius = float(np.linalg.norm(own[0, 0] - centre - height[0] * axis))
-    along = (x - centre) @ axis
-    across = np.linalg.norm(x - centre - along[..., None] * axis, axis=2)
-    return 1e3 * np.hypot(across - radius, along - height)
 
 
 def boots(whole, hidden) -> None:

@@ -92,12 +92,6 @@ def run() -> None:
         asked.append([[part in seen for part in _PARTS] for seen in take.seen])
     gap, gone, use = (np.concatenate(a) for a in (gaps, lost, asked))
     right = (gap <= WITHIN) | gone
-    wrong = use & (gap > WITHIN)
-    print(f"# {use.sum()} hands and elbows shown in {len(gap)} images: "
-          f"{100 * (gap[use] <= WITHIN).mean():.1f} % right, "
-          f"{100 * (wrong & gone).sum() / use.sum():.1f} % wrong and said; of those that are right "
-          f"{100 * gone[use & (gap <= WITHIN)].mean():.1f} % are said to be lost, too; of all, shown or not, "
-          f"{100 * right.mean():.1f} % right or said")  # fmt: skip
     figure("depth_near_right", 100 * float(right[use].mean()),
            f"% of hands and elbows within 4 cm, or said to be lost, {len(gap)} images", ">= 95")  # fmt: skip
     figure("depth_near_found", 100 * float((gap[use] <= WITHIN).mean()), "% of hands and elbows within 4 cm", ">= 70")

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import subprocess
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import NotMeasured, figure
 from benchmarks.timing import timed
-from kinefit.bodies.rendering import Canvas, render_body
+from kinefit.bodies.rendering import Canvas
 from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.geometry.camera import Camera
 from kinefit.simulation import KINECT, TOF, in_front, squat_and_wave
@@ -51,11 +50,6 @@ def run() -> None:
     figure("render_160_ms", ms[least.size], "ms/image", "<= 0.1")
     coarse = body_mesh(motion.body)
     figure("render_160_body_ms", drawn_ms(motion, coarse, least), "ms/image", "<= 0.1")
-    start = time.process_time()
-    for frame in range(FRAMES):
-        render_body(motion.body, motion.state(frame), least, mesh=coarse)
-    print(f"# with forward kinematics, {len(coarse.faces)} triangles and new arrays: "
-          f"{1e3 * (time.process_time() - start) / FRAMES:.2f} ms at 160 x 124")  # fmt: skip
     _beside_open3d(motion, mesh, large, ms[large.size])
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -14,8 +13,6 @@ from benchmarks.figures import amount, data, figure, quick, recording
 from benchmarks.timing import timed
 from kinefit.fitting.multiview.association import choose_people
 from kinefit.geometry.camera import ImageFrame
-from kinefit.geometry.lines import triangulate
-from kinefit.images.detectors.roi import MIRROR
 from kinefit.observations import Detections
 from kinefit.readers.assets import CAMERAS
 from kinefit.readers.calibration.read import read_calibration
@@ -62,7 +59,7 @@ def _trial(trial: Path, folder: Path) -> None:
     rig = read_calibration(trial / "Calib_refined_static.toml").select(CAMERAS)
     images = [ImageFrame.letterboxed(rig[name].size, found[name].size) for name in CAMERAS]
     chosen = choose_people(rig, [found[name].keypoints(image_frame=im) for name, im in zip(CAMERAS, images)])
-    errors, better, overlaps, present = [], [], [], 0
+    errors, overlaps, present = [], [], 0
     for name, person in zip(CAMERAS, chosen):
         there = np.flatnonzero(person >= 0)
         present += len(there)
@@ -70,16 +67,11 @@ def _trial(trial: Path, folder: Path) -> None:
         points = found[name].points[there, person[there]]
         seen = truth[there, :, 2] > 0.5
         gap = np.linalg.norm(points - truth[there, :, :2], axis=-1)
-        other = np.linalg.norm(points[:, MIRROR] - truth[there, :, :2], axis=-1)
-        mirrored = np.median(other, axis=1) < np.median(gap, axis=1)
         errors.append(gap[seen])
-        better.append(np.where(mirrored[:, None], other, gap)[seen])
         looked = there[:: amount(1, 5)]
         iou = [_overlap(found[name], f, int(person[f]), trial / "person_masks" / name / f"{f:03d}.png") for f in looked]
         overlaps += iou
-        print(f"  {name}: median {np.median(errors[-1]):.2f} px ({np.median(better[-1]):.2f} px with sides as in the "
-              f"other, {mirrored.sum()} pictures), masks {np.mean(iou):.3f}, lowest {min(iou):.3f}, "
-              f"{found[name].points.shape[1]} people")
+        print(f"  {name}: median {np.median(errors[-1]):.2f} px, masks {np.mean(iou):.3f}, lowest {min(iou):.3f}")
     _figure("detect_landmarks_difference", float(np.median(np.concatenate(errors))))
     _figure("detect_masks_iou", float(np.mean(overlaps)))
     _figure("detect_frames_tracked", 100 * present / (len(CAMERAS) * frames))
@@ -97,25 +89,7 @@ def _seated(seated: Path, folder: Path) -> None:
     rig = read_calibration(seated / "config.toml")
     ports = {name: seated / f"port_{name.removeprefix('cam_')}.mp4" for name in rig.names}
     found = _detect(ports, folder)
-    keypoints = [found[name].keypoints() for name in rig.names]
-    chosen = choose_people(rig, keypoints)
-    agreeing = [float(np.mean(person >= 0)) for person in chosen]
-    uv = np.stack([_of_person(found[name], person) for name, person in zip(rig.names, chosen)], axis=2)
-    x = triangulate(rig, uv.reshape(-1, len(rig.names), 2)).reshape(*uv.shape[:2], 3)
-    gaps = [np.linalg.norm(rig[name].project(x) - uv[:, :, c], axis=-1) for c, name in enumerate(rig.names)]
-    told = ", ".join(
-        f"{name} {100 * share:.0f} %, {np.nanmedian(gap):.1f} px" for name, share, gap in zip(rig.names, agreeing, gaps)
-    )
-    print(f"  seated person, pictures that agree with the other cameras, reprojection of the landmarks: {told}")
     _figure("detect_seated_tracked", 100 * float(np.mean([found[name].seen.any(axis=1) for name in rig.names])))
-
-
-def _of_person(found: Detections, person: Sequence[int] | np.ndarray) -> np.ndarray:
-    """(F, 33, 2) surely seen landmarks of the chosen person, NaN elsewhere."""
-    person = np.asarray(person)
-    rows = np.arange(len(person))
-    points, sure = found.points[rows, person], found.confidence[rows, person] > 0.5
-    return np.where((sure & (person >= 0)[:, None])[..., None], points, np.nan)
 
 
 def _figure(name: str, value: float) -> None:

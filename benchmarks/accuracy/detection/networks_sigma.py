@@ -3,8 +3,7 @@
 The built-in network's points in four videos; of each camera, by robust triangulation of the other three. Standard
 deviations by confidence and point are estimated from three cameras, and judged in the fourth: how far the share of
 errors within a probability is from that probability (mean over 10 to 90 % and over cameras), and how well they rank
-the points that are more than 50 mm off (area under the curve, mean over cameras). The balancing trial has the figures;
-of the other trial, in which a person is drawn into each image by itself, the same is printed.
+the points that are more than 50 mm off (area under the curve, mean over cameras).
 """
 
 from __future__ import annotations
@@ -38,9 +37,6 @@ def run() -> None:
     off, area = _judged(trial / "videos", trial / "Calib_refined_static.toml")
     figure("networks_sigma_calibration", off, "mean difference of shares", "<= 0.1")
     figure("networks_sigma_far", area, "area under the curve", ">= 0.92")
-    two = recording("video_two_people_4cam")
-    off, area = _judged(two, two / "Calib.qca.txt")
-    print(f"# two people, images moved: difference of shares {off:.3f}, area under the curve {area:.3f}")
 
 
 def _judged(videos: Path, calibration: Path) -> tuple[float, float]:

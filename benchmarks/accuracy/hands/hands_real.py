@@ -79,8 +79,6 @@ def _detected(videos: Path) -> tuple[Rig, dict[str, Keypoints]]:
 
 def _figures(kind: str, rig: Rig, seen: dict[str, Keypoints], up: str, missing: str) -> None:
     errors: list[tuple[NDArray, NDArray]] = []
-    if seen:
-        _lengths(triangulated(rig, list(seen.values())))
     for name in amount(rig.names, rig.names[:1]):
         errors.append(_held_out(rig, seen, name, up))
         px = [float(np.median(e)) if len(e) else float("nan") for e in errors[-1]]
@@ -108,15 +106,3 @@ def _held_out(rig: Rig, seen: dict[str, Keypoints], name: str, up: str) -> tuple
     judges = np.isfinite(fit) & np.isfinite(alone) & two_hands(measured)[:, None]
     judges[:, :_FIRST] = False
     return fit[judges], alone[judges]
-
-
-def _lengths(x: NDArray) -> None:
-    """Print how the lengths of bones spread that are triangulated; those of a body are the same in every frame."""
-    spread = []
-    for first in (_LEFT.start, _RIGHT.start):
-        for finger in range(5):
-            joints = x[:, first + 1 + 4 * finger : first + 5 + 4 * finger]
-            lengths = np.linalg.norm(np.diff(joints, axis=1), axis=-1)
-            middle = np.nanmedian(lengths, axis=0)
-            spread.append(1.4826 * np.nanmedian(np.abs(lengths - middle), axis=0) / middle)
-    print(f"# lengths of bones of fingers, triangulated: {100 * np.median(spread):.1f} % spread over the frames")

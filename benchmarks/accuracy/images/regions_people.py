@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.accuracy.images.silhouettes_track import overlaps
 from benchmarks.accuracy.images.silhouettes_track import take_text as masks_text
@@ -19,21 +17,13 @@ from benchmarks.accuracy.mixed import mixed_real
 from benchmarks.figures import LEFT_OUT, NotMeasured, amount, figure, quick, recording
 from benchmarks.scenes.balancing import CAMERAS, trial_text
 from benchmarks.scenes.takes import seen_of, tracked
-from kinefit.bodies import BodyState
-from kinefit.bodies.motion import UP_AXES, Motion
-from kinefit.bodies.rendering import render_body, scaled
-from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.fitting.multiview.association import choose_people
-from kinefit.fitting.smoothing.foot_contacts import find_contacts
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SilhouetteVideo
-from kinefit.papers.regions import pose_from_regions
-from kinefit.solving.correspondences.contours.outlines import RimFinder
 
 FRAMES = amount(100, 3)
 TRACKED = amount(CAMERAS, CAMERAS[:2])
 GOOD = 0.8  # overlap of a frame from which it counts as tracked, as of silhouettes
-SMALL = 0.35  # at which the paper's recipe sees the images
 GOALS = {
     "regions alone: mean IoU of 400 images": ">= 0.85",
     "regions alone: frames tracked": f"== {FRAMES}",
@@ -63,7 +53,6 @@ def run() -> None:
     print(f"  camera by camera {np.round(alone.mean(axis=0), 3)}, worst image {alone.min():.3f}; "
           f"lowest quality {motion.quality.min():.2f}")  # fmt: skip
     figure(names[1], float((alone.mean(axis=1) >= GOOD).sum()), "frames", GOALS[names[1]])
-    _with_contacts(folder, motion, rig, masks.silhouettes)
     if quick():
         raise NotMeasured(LEFT_OUT)
     held = []
@@ -73,28 +62,6 @@ def run() -> None:
         print(f"  {camera} held out: {held[-1]:.3f}", flush=True)
     figure(names[2], float(np.mean(held)), "", GOALS[names[2]])
     _beside_keypoints(folder, rig, masks.silhouettes)
-    _as_printed(folder, motion, rig, masks.silhouettes)
-
-
-def _with_contacts(folder: Path, motion: Motion, rig: Rig, masks: Sequence[SilhouetteVideo]) -> None:
-    """What changes where soles are held while they rest, on the beam or on the ground."""
-    held = tracked(take_text(folder, TRACKED), contacts=True)[0]
-    found = find_contacts(held.body, held.Ts_world_root, held.angles, held.rate, held.up)
-    resting = found.weight > 0
-    if not resting.any():
-        print("  contacts: no sole rests")
-        return
-    speed = [np.gradient(m.positions(found.points), axis=0)[resting] * m.rate for m in (motion, held)]
-    still = [1e3 * float(np.median(np.linalg.norm(v, axis=1))) for v in speed]
-    height = (found.places @ np.array(UP_AXES[held.up]))[resting]
-    share = overlaps(held, rig, masks).mean()
-    turned = np.degrees(np.median(np.abs(held.angles - motion.angles).max(axis=0)))
-    print(
-        f"  contacts: soles rest in {int(resting.any(axis=1).sum())} frames of {len(held)}, at heights from "
-        f"{height.min():.2f} to {height.max():.2f} m; while they do they move at {still[1]:.0f} mm/s "
-        f"instead of {still[0]:.0f}; IoU {share:.3f}; angles change by {turned:.1f} degrees at most (median of all)",
-        flush=True,
-    )
 
 
 def _beside_keypoints(folder: Path, rig: Rig, masks: Sequence[SilhouetteVideo]) -> None:
@@ -109,26 +76,3 @@ def _beside_keypoints(folder: Path, rig: Rig, masks: Sequence[SilhouetteVideo]) 
     figure(names[3], off[1] / off[0], "x", GOALS[names[3]])
     figure(names[4], share[1] - share[0], "", GOALS[names[4]])
     print(f"  keypoints alone {off[0]:.2f} px, IoU {share[0]:.3f}; with regions {off[1]:.2f} px, {share[1]:.3f}")
-
-
-def _as_printed(folder: Path, motion: Motion, rig: Rig, masks: Sequence[SilhouetteVideo]) -> None:
-    """The paper's own recipe from the same first pose, on the same body, in images a third as large."""
-    videos = seen_of(take_text(folder)).regions
-    small, body = Rig(tuple(scaled(camera, SMALL) for camera in rig)), motion.body
-    mesh, state, shares = body_mesh(body), BodyState(motion.Ts_world_root[0], motion.angles[0]), list[float]()
-    finder = RimFinder(mesh)
-    for i in range(FRAMES):
-        images = {v.sensor: _resized(v.frame(i).image, small[v.sensor].size) for v in videos}
-        state = pose_from_regions(body, state, small, images, mesh=mesh, finder=finder).state
-        for video in masks:
-            camera = scaled(rig[video.sensor], 0.25)
-            seen = render_body(body, state, camera, mesh=mesh).seen
-            mask = cv2.resize(video.frame(i).mask, camera.size, interpolation=cv2.INTER_AREA) > 127
-            shares.append((seen & mask).sum() / max((seen | mask).sum(), 1))
-    each = np.reshape(shares, (FRAMES, -1)).mean(axis=1)
-    print(f"# the paper's recipe on the same body: IoU {each.mean():.3f}, {(each >= GOOD).sum()} frames of {FRAMES} "
-          f"at {GOOD} or more, the last one {each[-1]:.3f}")  # fmt: skip
-
-
-def _resized(image: NDArray, size: tuple[int, int]) -> NDArray:
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))

@@ -120,17 +120,9 @@ def run(names: list[str] | None = None) -> None:
 
 
 def calibration(rows: list[dict[str, Score]]) -> None:
-    """How many names of each probability are right, in single frames of all kinds; and in segments of two points."""
+    """How many names given at about 0.9 are right, in single frames of all kinds; and in segments of two points."""
     kept = [s[kind].names for s in rows for kind in VARIANTS]
     names = np.concatenate([n for n in kept if n is not None] or [np.empty((0, 3))])
-    print("probability: names, on average, right [%]; of segments with two points or one")
-    for low, high in ((0.3, 0.5), (0.5, 0.7), (0.7, 0.8), (0.8, 0.85), (0.85, 0.95), (0.95, 0.98), (0.98, 1.0)):
-        line = f"  {low:.2f} to {high:.2f}"
-        for own in (names, names[names[:, 2] <= 2]):
-            here = own[(own[:, 0] >= low) & (own[:, 0] < high)]
-            mean = here.mean(0) if len(here) else np.full(3, np.nan)
-            line += f" | {len(here):6d} {100 * mean[0]:6.1f} {100 * mean[1]:6.1f}"
-        print(line)
     near = names[(names[:, 0] >= 0.85) & (names[:, 0] < 0.95)]
     value = 100 * float(near[:, 1].mean()) if len(near) else None
     figure("markers_real_calibration", value, f"% right of {len(near)} names given at 0.9", ">= 90", "no such names")

@@ -5,11 +5,10 @@
 Groups, each with its figures: "sensors" (each sensor helps), "intervals" (the truth lies inside the stated 95 %
 interval), "doubt" (what is called doubtful is wrong) and "alone" (the intervals of markers and of silhouettes alone,
 smoothed), both where they are asked for, "smoothing" (it helps every mix), "cameras" (calibrations that are exact, off
-and wrong), "misfit" (sensors whose calibrations do not fit each other), "unknowns" (of a sensor of one's own), "real"
-(a second sensor never harms the balancing trial), "memory" (what each frame of a long take needs). All but the last two
-are of simulated takes: see `mixed_takes` for the person, motion and sensors, `mixed_runs` for the
-mixes and conditions, `mixed_figures` for definitions. True surface: Anny; fitted body: the catalogue's
-humanoid of cylinders, its size found by `kinefit.track_take`.
+and wrong), "unknowns" (of a sensor of one's own), "real" (a second sensor never harms the balancing trial), "memory"
+(what each frame of a long take needs). All but the last two are of simulated takes: see `mixed_takes` for the person,
+motion and sensors, `mixed_runs` for the mixes and conditions, `mixed_figures` for definitions. True surface: Anny;
+fitted body: the catalogue's humanoid of cylinders, its size found by `kinefit.track_take`.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ SIMULATED = {
     "sensors": mixed_figures.sensors, "intervals": mixed_figures.intervals, "alone": mixed_figures.alone,
     "smoothing": mixed_figures.smoothing, "doubt": mixed_doubt.doubt,
 }  # fmt: skip
-GROUPS = (*SIMULATED, "cameras", "misfit", "unknowns", "real", "memory")
+GROUPS = (*SIMULATED, "cameras", "unknowns", "real", "memory")
 DRAWS, QUICK_DRAWS, QUICK_SECONDS = 30, 1, 0.4
 
 
@@ -72,7 +71,6 @@ def main(words: Sequence[str]) -> None:
         which = range(told.first, told.first + draws)
         outcomes = track_draws(which, frames, runs, told.each, told.workers)
         print(f"# {draws} draws, {told.each or len(runs)} takes of each, {time.perf_counter() - begin:.0f} s")
-        mixed_figures.table(outcomes)
         for group in simulated:
             print(f"\n# {group}", flush=True)
             SIMULATED[group](outcomes)

@@ -22,20 +22,15 @@ from kinefit.exporters.report.moments import doubtful
 def doubt(told: Told) -> None:
     """Print precision and recall of every run, and those of all."""
     failed = [one for draws in told.values() for one in draws if isinstance(one, str)]
-    counts, frames, all_of = np.zeros((2, 3), int), [], []
+    counts, all_of = np.zeros((2, 3), int), []
     for run, draws in told.items():
         kept = [o for o in draws if isinstance(o, Outcome)]
         if not kept:
             continue
         own = sum(_counts(o) for o in kept)
         counts += own
-        said = np.concatenate([doubtful(o.doubt[1], o.doubt[2] > 0).any(axis=1) for o in kept])
-        frames.append(said)
         all_of += [o.doubt[:2].reshape(2, -1) for o in kept]
-        share = 100 * float(said.mean())
-        print(f"# {' '.join(run)}: {_text(own[0])}; with what is lost {_text(own[1])}; {share:.0f} % of the frames")
-    share = 100 * float(np.concatenate(frames).mean()) if frames else 0.0
-    print(f"# all: {_text(counts[0])}; with what is lost {_text(counts[1])}; {share:.0f} % of the frames")
+        print(f"# {' '.join(run)}: {_text(own[0])}; with what is lost {_text(own[1])}", flush=True)
     reason = f"{len(failed)} runs failed, first {failed[0]}" if failed else ""
     for name, (hits, said, errors) in zip(("doubt", "said"), counts):
         some = bool(errors) and bool(said) and not failed
@@ -50,9 +45,6 @@ def doubt(told: Told) -> None:
         classes = np.minimum((10 * likely).astype(int), 9)
         off = [abs(far[classes == c].mean() - likely[classes == c].mean()) for c in np.unique(classes)]
         calibration = float(np.average(off, weights=np.unique(classes, return_counts=True)[1]))
-        for c in np.unique(classes):
-            own = classes == c
-            print(f"# stated {100 * likely[own].mean():.0f} %: {100 * far[own].mean():.0f} % of {own.sum()} are errors")
     figure("mixed_doubt_auc", auc, "AUC of errors above 5 cm", ">= 0.92", reason)
     figure("mixed_doubt_calibration", calibration, "expected calibration error of the probability", "<= 0.05", reason)
 

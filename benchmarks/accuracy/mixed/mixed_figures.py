@@ -34,24 +34,6 @@ SAMPLES, FEWEST, SIGMAS = 2000, 200, 1.96
 NOISE = 0.3  # [m/s²] that no smoothing need improve
 
 
-def table(told: Told) -> None:
-    """Print errors, stated deviations and time of every run, and what failed in which way."""
-    for run, draws in told.items():
-        kept = [one for one in draws if isinstance(one, Outcome)]
-        reasons = sorted({one for one in draws if isinstance(one, str)})
-        text = f"# {' '.join(run)}: {len(kept)} of {sum(one is not None for one in draws)} draws"
-        if kept:
-            known = lambda array: array[np.isfinite(array)]
-            sigma = 1e3 * _mean([_mean(known(o.sigma)) for o in kept])
-            text += (
-                f", joints {1e3 * _mean([o.distance.mean() for o in kept]):.1f} mm (median draw "
-                f"{1e3 * np.median([o.distance.mean() for o in kept]):.1f}), sigma {sigma:.1f} mm, angles "
-                f"{_mean([np.degrees(np.abs(o.turn).mean()) for o in kept]):.1f} deg, "
-                f"{_mean([o.seconds for o in kept]):.1f} s"
-            )
-        print("; ".join([text, *reasons]), flush=True)
-
-
 def sensors(told: Told) -> None:
     """Print what each sensor adds."""
     for less, more in PAIRS:
@@ -73,14 +55,12 @@ def sensors(told: Told) -> None:
 
 
 def intervals(told: Told) -> None:
-    """Print how often the truth lies inside the stated 95 % interval, and how much is stated."""
+    """Print how often the truth lies inside the stated 95 % interval."""
     cells: dict[tuple[str, str], dict[Run, NDArray]] = {}  # (group, what): run: (draws, 2) inside, all
     missing = [run for run in told if _of(told, run)[1]]
     for run in told:
-        outcomes, reason = _of(told, run)
-        for key, counts in _counts(told[run] if outcomes else []).items():
+        for key, counts in _counts(told[run] if _of(told, run)[0] else []).items():
             cells.setdefault(key, {})[run] = counts
-        _stated("_".join(run), outcomes, reason)
     share = lambda rows: rows[:, 0].sum() / max(rows[:, 1].sum(), 1.0)
     whole = f"{len(missing)} runs failed, first {' '.join(missing[0])}: {_of(told, missing[0])[1]}" if missing else ""
     for what in ("joints", "angles"):
@@ -91,19 +71,11 @@ def intervals(told: Told) -> None:
                 figure(f"inside_{what}_{group}_least", 100 * value, "%", ">= 90", whole)
                 figure(f"inside_{what}_{group}_most", 100 * value, "%", "<= 98", whole)
         single = [
-            (100 * share(counts), run, group, counts) for (group, kind), runs in cells.items() if kind == what
-            for run, counts in runs.items() if counts[:, 1].sum() >= FEWEST
+            100 * share(counts) for (_, kind), runs in cells.items() if kind == what
+            for counts in runs.values() if counts[:, 1].sum() >= FEWEST
         ]  # fmt: skip
-        single.sort(key=lambda cell: cell[0])
-        for value, run, group, counts in [*single[:3], *single[3:][-3:]]:
-            low, _, high = _interval(share, counts, sides=2)
-            print(f"# {what} {' '.join(run)} {group}: {value:.1f} % ({100 * low:.1f} to {100 * high:.1f})")
-        figure(f"inside_{what}_lowest_cell", single[0][0] if single else None, "%", ">= 85", whole)
-        figure(f"inside_{what}_highest_cell", single[-1][0] if single else None, "%", "<= 99.5", whole)
-        for run in told:
-            own = [runs[run] for (_, kind), runs in cells.items() if kind == what and run in runs]
-            if own:
-                print(f"# {what} {' '.join(run)}: {100 * share(np.concatenate(own)):.1f} % inside")
+        figure(f"inside_{what}_lowest_cell", min(single, default=None), "%", ">= 85", whole)
+        figure(f"inside_{what}_highest_cell", max(single, default=None), "%", "<= 99.5", whole)
     figure("runs_that_failed", float(len(missing)), "runs", "== 0")
     if missing:
         print(f"# {whole}")
@@ -142,23 +114,6 @@ def smoothing(told: Told) -> None:
         whole, behind, reason = _both(told, (mix, "smoothed"), (mix, "lag"))
         ratio = [b.passing / a.passing for a, b in zip(whole, behind)]
         figure(f"fixed_lag_error_{mix}", _mean(ratio) if ratio else None, "x", "<= 1.15", reason)
-
-
-def _stated(name: str, outcomes: Sequence[Outcome], reason: str) -> None:
-    """Share of what is observable that has a finite sigma, and sigma as a multiple of the error."""
-    for what, sigma_of, error_of, seen_of in (
-        ("joints", lambda o: o.sigma, lambda o: o.shift, lambda o: o.seen),
-        ("angles", lambda o: o.turn_sigma, lambda o: o.turn, lambda o: o.seen_turn),
-    ):
-        shares, sigmas, errors = [], [], []
-        for o in outcomes:
-            finite, seen = np.isfinite(sigma_of(o)), seen_of(o) >= 0.5
-            shares.append(finite[:, seen].mean())
-            sigmas.append(sigma_of(o)[finite].mean() if finite.any() else np.nan)
-            errors.append(np.sqrt(np.mean(np.square(error_of(o)[finite]))) if finite.any() else np.nan)
-        figure(f"finite_{what}_{name}", 100 * _mean(shares), "% of what is observable", ">= 90", reason)
-        rms = float(np.sqrt(_mean(np.square(errors)))) if errors else np.nan
-        figure(f"sigma_{what}_{name}", _mean(sigmas) / rms if errors else None, "x rms error", "<= 1.5", reason)
 
 
 def _counts(outcomes: Sequence[Outcome | str | None]) -> dict[tuple[str, str], NDArray]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
@@ -24,7 +23,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.mixed.mixed_observable import observable
 from benchmarks.accuracy.mixed.mixed_takes import CAMERAS, MASK_SCALE, Recording, detected, record, take_text, write
 from benchmarks.accuracy.video.smoothing import acceleration_noise, peak_speeds
 from kinefit import Motion, track_take
@@ -59,8 +57,6 @@ class Outcome:
     turn, turn_sigma : (F, D) [rad] the same of angles
     noise : float [m/s²] of the error above 10 Hz (`smoothing`)
     peak : float, speed of hands and feet that a fiftieth of the frames exceed, as a share of the truth
-    seen, seen_turn : (S, 3), (D,) share of the frames in which joint centres and angles are observable
-    seconds : float
     doubt : (4, F, S) segments of which an end is farther off than 5 cm; how likely that is by the motion; 1 where views
         contradict; 1 where they are lost
     """
@@ -71,9 +67,6 @@ class Outcome:
     turn_sigma: NDArray
     noise: float
     peak: float
-    seen: NDArray
-    seen_turn: NDArray
-    seconds: float
     doubt: NDArray
 
     @property
@@ -90,7 +83,7 @@ class Outcome:
 Told = dict[Run, list[Outcome | str | None]]  # of every draw, in order; None where a draw has not this run
 
 
-def compare(truth: Motion, motion: Motion, seen: tuple[NDArray, NDArray], seconds: float) -> Outcome:
+def compare(truth: Motion, motion: Motion) -> Outcome:
     """What is kept of a tracked take."""
     turn = np.radians(angle_errors(truth, motion))  # checks frames, rate and body
     motion = motion if motion.up == truth.up else motion.turned(truth.up)
@@ -98,8 +91,7 @@ def compare(truth: Motion, motion: Motion, seen: tuple[NDArray, NDArray], second
     few = lambda array: np.asarray(array, np.float32)
     return Outcome(
         few(shift), few(motion.joint_std), few(turn), few(motion.dof_std[:, 6:]),
-        acceleration_noise(shift, truth.rate), float(np.median(peak_speeds(motion) / peak_speeds(truth))), *seen,
-        seconds,
+        acceleration_noise(shift, truth.rate), float(np.median(peak_speeds(motion) / peak_speeds(truth))),
         np.array([
             error_of_ends(truth, motion) > DOUBT_DISTANCE_M, probably_far(end_variances(motion)),
             contradicted(motion), motion.lost,
@@ -174,7 +166,6 @@ def spoiled(recording: Recording, draw: int) -> Recording:
 def draw_runs(draw: int, frames: int, runs: Sequence[Run]) -> dict[Run, Outcome | str]:
     """Record one draw, and track it in every run."""
     recording, out = record(draw, frames, depth=any("depth" in MIXES[mix] for mix, _ in runs)), {}
-    seen = {mix: observable(recording.truth, recording.rig, MIXES[mix]) for mix in dict.fromkeys(m for m, _ in runs)}
     with tempfile.TemporaryDirectory() as work:
         for mix, condition in runs:
             kind = condition if condition in ("outliers", "lost") else "usual"
@@ -185,11 +176,10 @@ def draw_runs(draw: int, frames: int, runs: Sequence[Run]) -> dict[Run, Outcome 
                 write(made[kind]() if kind in made else without(recording, stream), folder)
             take = folder / f"{mix}.toml"
             take.write_text(take_text(folder, MIXES[mix]))
-            begin = time.perf_counter()
             try:
                 lag = LAG if condition == "lag" else None
                 motion = track_take(take, smooth=condition != "frames", lag=lag)[0]
-                out[mix, condition] = compare(recording.truth, motion, seen[mix], time.perf_counter() - begin)
+                out[mix, condition] = compare(recording.truth, motion)
             except Exception as error:  # whatever it is, it is told with the figure
                 out[mix, condition] = f"{type(error).__name__}: {error}".replace(work, "")
     return out

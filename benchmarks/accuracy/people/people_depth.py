@@ -1,11 +1,11 @@
-"""One person before a real depth camera, by the command's road: hands, elbows and heads against what was read by hand.
+"""One person before a real depth camera, by the command's road: hands and elbows against what was read by hand.
 
 Pixels below were read from the images, to about 5 px: middle of the hand, between the wrist (where the forearm no
-longer narrows) and the knuckles (2 cm nearer than where stretched fingers part, 1 cm from a fist's end), middle of the
-head, and the lower end of a raised forearm. A hand lies 1.5 cm behind the surface that is seen there, an elbow 4 cm, a
-head 8 cm. A fist that points to the camera (the forearm is seen beside it, 10 to 30 cm farther off, or hidden by it)
-shows its knuckles: the middle of the hand lies half of the 9 cm from there to the wrist behind them, and 1 cm of flesh.
-Nothing was fitted to them. Two people are in the first and the last image of the Kinect: the nearer counts.
+longer narrows) and the knuckles (2 cm nearer than where stretched fingers part, 1 cm from a fist's end), and the lower
+end of a raised forearm. A hand lies 1.5 cm behind the surface that is seen there, an elbow 4 cm. A fist that points to
+the camera (the forearm is seen beside it, 10 to 30 cm farther off, or hidden by it) shows its knuckles: the middle of
+the hand lies half of the 9 cm from there to the wrist behind them, and 1 cm of flesh. Nothing was fitted to them. Two
+people are in the first and the last image of the Kinect: the nearer counts.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from kinefit.readers.take.load import Observations
 
 Read = dict[str, tuple[int, int]]  # part of the body: pixel
 KINECT: dict[str, Read] = {  # in the order of the files' numbers
-    "82823944": {"hand_r": (89, 260), "hand_l": (424, 258), "head": (247, 160)},
-    "1028894671": {"fist_r": (110, 367), "fist_l": (505, 331), "head": (306, 160)},
-    "1038901490": {"hand_r": (101, 415), "hand_l": (518, 109), "head": (309, 160)},
-    "1045879925": {"hand_r": (97, 128), "hand_l": (516, 101), "head": (318, 165)},
-    "1051883281": {"hand_r": (70, 49), "hand_l": (543, 53), "head": (302, 170)},
-    "1058893191": {"hand_r": (123, 216), "hand_l": (494, 192), "head": (302, 161)},
-    "1064898470": {"hand_r": (96, 411), "hand_l": (512, 383), "head": (310, 163)},
-    "1070905432": {"hand_r": (42, 65), "fist_l": (440, 327), "head": (314, 165)},
-    "1078881076": {"fist_r": (151, 327), "fist_l": (461, 301), "head": (289, 175)},
-    "1166565565": {"fist_r": (121, 386), "hand_l": (479, 54), "head": (309, 116)},
-    "1234568668": {"fist_r": (84, 282), "hand_l": (490, 111), "head": (284, 123)},
-    "1399145206": {"hand_l": (471, 213), "head": (309, 160)},
+    "82823944": {"hand_r": (89, 260), "hand_l": (424, 258)},
+    "1028894671": {"fist_r": (110, 367), "fist_l": (505, 331)},
+    "1038901490": {"hand_r": (101, 415), "hand_l": (518, 109)},
+    "1045879925": {"hand_r": (97, 128), "hand_l": (516, 101)},
+    "1051883281": {"hand_r": (70, 49), "hand_l": (543, 53)},
+    "1058893191": {"hand_r": (123, 216), "hand_l": (494, 192)},
+    "1064898470": {"hand_r": (96, 411), "hand_l": (512, 383)},
+    "1070905432": {"hand_r": (42, 65), "fist_l": (440, 327)},
+    "1078881076": {"fist_r": (151, 327), "fist_l": (461, 301)},
+    "1166565565": {"fist_r": (121, 386), "hand_l": (479, 54)},
+    "1234568668": {"fist_r": (84, 282), "hand_l": (490, 111)},
+    "1399145206": {"hand_l": (471, 213)},
 }
 SR305: dict[str, dict[str, Read]] = {
     "20210326-230536": {
@@ -56,8 +56,8 @@ SR305: dict[str, dict[str, Read]] = {
         "220": {"hand_r": (348, 301)},
     },
 }  # fmt: skip
-BEHIND = {"hand": 0.015, "fist": 0.055, "elbow": 0.04, "head": 0.08}  # [m] of the part's middle behind its surface
-SEGMENTS = {"hand": "hand", "fist": "hand", "elbow": "forearm", "head": "head"}
+BEHIND = {"hand": 0.015, "fist": 0.055, "elbow": 0.04}  # [m] of the part's middle behind its surface
+SEGMENTS = {"hand": "hand", "fist": "hand", "elbow": "forearm"}
 _GOALS = {
     "people_kinect_images": ("images with the person found", "== 12"),
     "people_kinect_right": ("hands of 23 within 6 cm, lost or not", ">= 21"),
@@ -101,9 +101,7 @@ def _kinect() -> None:
         (motion, seen), spent = took(partial(tracked, text))
         gaps = _gaps(motion, seen, dict(enumerate(KINECT[name] for name in names)))
     figure("people_kinect_images", float(np.sum(motion.quality > 0.0)), *_GOALS["people_kinect_images"])
-    _figures("people_kinect", [gap for (_, of), gap in gaps.items() if of != "head"], 0.06, spent / len(names))
-    heads = [gap for (_, of), (gap, _) in gaps.items() if of == "head"]
-    print(f"# heads, the middle between the ears: median {100 * float(np.median(heads)):.0f} cm off")
+    _figures("people_kinect", list(gaps.values()), 0.06, spent / len(names))
     _tell(gaps, names, 0.06)
 
 
@@ -141,13 +139,11 @@ def _gaps(motion: Motion, seen: Observations, read: Mapping[int, Read]) -> dict[
         for part, pixel in parts.items():
             kind, _, side = part.partition("_")
             true = _point(seen, i, pixel, BEHIND[kind])
-            if kind == "head":
-                found = (at("r_tragion", i) + at("l_tragion", i)) / 2.0
-            elif kind == "elbow":
+            if kind == "elbow":
                 found = at(f"{side}_elbow", i)
             else:
                 found = (at(f"{side}_wrist", i) + at(f"{side}_metacarpal_phalanx_3", i)) / 2.0
-            segment = segments.index("head" if kind == "head" else f"{SEGMENTS[kind]}_{side}")
+            segment = segments.index(f"{SEGMENTS[kind]}_{side}")
             lost = bool(motion.segment_quality[i, segment] < BELIEVED)
             out[i, part] = float(np.linalg.norm(found - true)), lost
     return out

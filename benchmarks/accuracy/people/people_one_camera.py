@@ -6,7 +6,7 @@ markers once for the whole trial by a turn and a shift. OpenCap Monocular's own 
 stature that is stated is the markers': as much of the humanoid's as their thighs, shanks and upper arms are of its own.
 `without_stature`: the same command on the take as `kinefit init` leaves it; the network's metres then set the size.
 
-Settings were chosen on each camera of the balancing trial alone, against the motion from all four: `_balancing`.
+Settings were chosen on each camera of the balancing trial alone, against the motion from all four.
 """
 
 from __future__ import annotations
@@ -68,8 +68,6 @@ def run() -> None:
         with tempfile.TemporaryDirectory() as folder:
             shutil.copy(root / trial / "video.mp4", Path(folder, f"{trial}.mp4"))
             errors.append(_of_trial(root / trial, Path(folder), trial))
-    if not quick():
-        _balancing()
     for name, (unit, goal) in _GOALS.items():
         if name == "one_camera_frames":
             figure(name, sum(e["frames"] for e in errors) / sum(e["seconds"] for e in errors), unit, goal)
@@ -103,40 +101,6 @@ def _of_trial(markers: Path, folder: Path, trial: str) -> Mapping[str, float]:
     print(f"{trial}: {len(motion)} frames in {seconds:.1f} s", flush=True)
     ours["one_camera_absolute_without_stature"] = unstated["one_camera_absolute"]
     return {**ours, "frames": len(motion), "seconds": seconds}
-
-
-def _balancing() -> None:
-    """Each camera of the balancing trial alone, not calibrated, against all four: told, no figures."""
-    root = data("video_balancing_4cam")
-    if root is None:
-        return
-    alone = []
-    with tempfile.TemporaryDirectory() as where:
-        together = Path(where, "all")
-        together.mkdir()
-        for file in (*(root / "videos").glob("*.mp4"), root / "Calib_refined_static.toml"):
-            shutil.copy(file, together)
-        ended("init", together, check=True)
-        truth = _tracked(together / "take.toml")
-        x = joints_of(truth, 1.0)
-        for video in sorted(together.glob("*.mp4")):
-            folder = Path(where, video.stem)
-            (folder / "take-detect").mkdir(parents=True)
-            shutil.copy(video, folder)
-            shutil.copy(together / "take-detect" / f"{video.stem}.npz", folder / "take-detect")
-            ended("init", folder, check=True)
-            take = folder / "take.toml"
-            take.write_text(take.read_text().replace("# height = 1.75", f"height = {truth.body.stature:.2f}  #"))
-            motion = _tracked(take)
-            alone.append(against(motion.times, joints_of(motion, 1.0), truth.times, x, std_of(motion)))
-    for name in ("relative", "absolute", "knee", "inside_least"):
-        values = [one[f"one_camera_{name}"] for one in alone]
-        print(f"# balancing trial, each camera alone: {name} {np.mean(values):.1f} ({np.round(values, 1)})", flush=True)
-
-
-def _tracked(take: Path) -> Motion:
-    ended("track", take, "--person", "first", "--pictures", "none", "--no-report", check=True)
-    return read_motion(take.with_name("take-kinefit") / "motion.npz")
 
 
 def joints_of_file(path: Path) -> tuple[NDArray, NDArray]:

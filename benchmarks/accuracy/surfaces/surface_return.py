@@ -39,7 +39,7 @@ def run() -> None:
             late += frames
     without, due, found, false = np.sum(told, axis=0)
     print(f"# {due} points came into view again, {found} found under their names, {false} wrong; {without} without")
-    figure("surface_return_without", 100 * without / max(due, 1), "% of points found again, without the motion", ">= 0")
+    figure("surface_return_without", 100 * without / max(due, 1), "% of points found again, without the motion", "<= 1")
     figure("surface_return_found", 100 * found / max(due, 1), "% of points found again", ">= 50")
     figure("surface_return_false", 100 * false / max(found, 1), "% of these more than 2 mm off", "<= 1")
     soon = 100 * float(np.mean(np.abs(late) <= SOON)) if late else None

@@ -152,7 +152,6 @@ def _challenge(work: Path) -> None:
     shift = np.interp(places[:, 0], truth[:, 0], truth[:, 5])
     off = np.linalg.norm(end - places - np.column_stack([shift, np.zeros(len(shift))]), axis=1)
     live = np.isfinite(off)
-    print(f"# challenge: {np.sqrt(np.mean(off[live] ** 2)):.3f} px RMS, worst {off[live].max():.3f}")
     _report("challenge", off <= RIGHT_DIC_PX, live, live)
 
 
@@ -186,7 +185,6 @@ def _cylinder(work: Path) -> None:
         both = ~half & live
         T, _ = rigid_motion(first[both], last[both])
         off[half] = np.linalg.norm(first[half] @ T[:3, :3].T + T[:3, 3] - last[half], axis=1)
-    print(f"# cylinder: {1e3 * np.sqrt(np.mean(off[live] ** 2)):.4f} mm RMS, worst {1e3 * off[live].max():.4f}")
     never = np.zeros(max(0, int(start.measured.sum()) - len(live)), bool)  # measured at first, and cut off at once
     live, right = np.append(live, never), np.append(off <= RIGHT_M, never)
     _report("cylinder", right, live, live)
@@ -258,10 +256,6 @@ def _help(work: Path) -> None:
     options = ["--window", SIDE, "--step", 8, "--reach", 12, "--mask", work / "mask.png"]
     calibration = [folder / "Calib_refined_static.toml", f"{camera}={work / 'man.avi'}", "--unit", "m"]
     printed("surface", *calibration, "--motion", work / "motion", *options, "-o", work / "on")
-    printed("surface", work / "man.avi", "--flat", 1, *options, "-o", work / "off")
-    for name in ("off", "on"):
-        live = np.isfinite(read_paths(work / name / "trajectories.csv", count, RATE)[1][..., 0]).sum(axis=1)
-        print(f"# help {name}: {live[0]} points at first, {live[count // 2]} in the middle, {live[-1]} at the end")
     ids, x = read_paths(work / "on" / "trajectories.csv", count, RATE)
     view, splines = read_calibration(folder / "Calib_refined_static.toml", unit="m")[camera], {}
     with (work / "on" / "returns.csv").open() as lines:
@@ -286,16 +280,14 @@ def _help(work: Path) -> None:
 
 def _drawn_spheres() -> None:
     """Centroids of drawn spheres 4 to 12 px wide on shaded skin, noise of 2 grey values."""
-    rng, off, missed = np.random.default_rng(5), [], 0
+    rng, off = np.random.default_rng(5), []
     for diameter in (4, 6, 8, 12):
         for _ in range(amount(50, 5)):
             centre = 30 + rng.uniform(-0.5, 0.5, 2)
             image = drawn_sphere(centre, diameter) + rng.normal(0.0, 2.0, (60, 60))
             uv, _ = find_spots(np.clip(np.rint(image), 0, 255), diameter + 2)
             gap = np.linalg.norm(uv - centre, axis=1)
-            missed += not (gap < 2).any()
             off += [gap.min()] if (gap < 2).any() else []
-    print(f"# drawn spheres: {len(off)} found, {missed} not")
     figure("sequence_spheres_drawn", float(np.sqrt(np.mean(np.square(off)))), "px RMS", "<= 0.1")
 
 
@@ -330,6 +322,3 @@ def _spheres(work: Path, name: str) -> None:
     right = np.linalg.norm(uv[-1, path] - table[:, 2:], axis=1) <= RIGHT_MARK_PX
     _report(f"spheres_{name}", right, live, np.ones(len(marks), bool))
 
-
-if __name__ == "__main__":
-    run()

@@ -34,33 +34,10 @@ def _stereo() -> None:
     reference = read_calibration(folder, image_size=(640, 480), unit=0.025)
     board, seen = find_boards(camera_sources([folder]), Board.parse("checkerboard:9x6:0.025"))
     found = calibrate_board(seen, board)
-    for axis, name in enumerate("xy"):
-        mean, true = (np.mean([camera.matrix[axis, axis] for camera in rig]) for rig in (found.rig, reference))
-        print(f"  stereo: focal length along {name} {mean:.1f} px, OpenCV's sample {true:.1f} px")
     focal = max(abs(100 * (a.matrix[0, 0] / b.matrix[0, 0] - 1)) for a, b in zip(found.rig, reference))
     figure("board_stereo_focal", focal, "%", "<= 1")
     figure("board_stereo_baseline", _distances(found, reference), "%", "<= 1")
     figure("board_stereo_rms", found.rms_px, "px", "<= 0.5")
-    for name, rig in (("found", found.rig), ("OpenCV's sample", reference)):
-        print(f"  stereo: rms distance from epipolar lines {_epipolar(rig, seen):.3f} px ({name})")
-
-
-def _epipolar(rig: Rig, seen: dict) -> float:
-    """RMS distance [px] of the corners from the epipolar lines of their partners, without lens distortion."""
-    left, right = rig
-    pairs = [(a, seen[right.name].frames[f]) for f, a in seen[left.name].frames.items() if f in seen[right.name].frames]
-    T = right.T_camera_world @ left.T_world_camera
-    tx, ty, tz = T[:3, 3]
-    E = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ T[:3, :3]
-    rays = [
-        camera.with_pose(np.eye(4)).ray(np.concatenate([pair[i].uv for pair in pairs]))
-        for i, camera in enumerate((left, right))
-    ]
-    x, y = (ray / ray[:, 2:] for ray in rays)
-    line = x @ E.T
-    return float(
-        right.matrix[0, 0] * np.sqrt(np.mean((np.sum(y * line, axis=1) / np.linalg.norm(line[:, :2], axis=1)) ** 2))
-    )
 
 
 def _webcams(name: str, inner: str) -> tuple[BoardCalibration, Rig] | None:
@@ -76,12 +53,6 @@ def _webcams(name: str, inner: str) -> tuple[BoardCalibration, Rig] | None:
     print(
         f"    between views the board is off by {1e3 * kept.jitter[0]:.1f} mm, {np.degrees(kept.jitter[1]):.2f} deg;"
         f" distances within {_distances(kept, reference):.2f} %"
-    )
-    own = calibrate_board(seen, board)
-    focal = max(abs(100 * (a.matrix[0, 0] / b.matrix[0, 0] - 1)) for a, b in zip(own.rig, reference))
-    print(
-        f"  {name}, interiors found too: rms {own.rms_px:.2f} px, focal lengths within {focal:.1f} %, "
-        f"distances within {_distances(own, reference):.1f} %"
     )
     return kept, reference
 

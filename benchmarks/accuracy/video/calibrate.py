@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.video.static_points import HIGH, static_residual
+from benchmarks.accuracy.video.static_points import static_residual
 from benchmarks.accuracy.video.tracking import (
     DETECTORS,
     NOISE,
@@ -40,7 +40,6 @@ from kinefit.simulation import cut, simulate_keypoints, studio_rig
 
 RESIDUAL = {"openpose": 7.0, "mediapipe": 9.0}
 MOTIONS = ["wash 02_10", "jumping jacks 13_30", "reach 14_20", "twists and squats 13_30", "lift 02_06", "bend 02_06"]
-SHORT = "walk 02_01"  # three seconds: told, but no recording to calibrate from
 LATE = (0.0, 0.4, -1.7, 5.0)  # frames that each camera's clock is late
 FOCAL = (1.02, 0.98, 1.02, 0.98)
 _LONGEST, _DISTANCE, _SURE = amount(600, 30), 5.0, 0.3  # frames; [m]; confidence
@@ -73,30 +72,20 @@ def real_trial(folder: Path, where: Path) -> None:
     for detector in DETECTORS:
         trial = read_trial(folder, detector, where)
         goal = f"<= {RESIDUAL[detector]:g}"
-        before = track(Recording.of_keypoints(shipped, trial.keypoints), body)
         found, seconds = took(partial(refine, shipped, trial.keypoints, body))
         for line in found.summary_lines():
             print(f"# {detector}: {line}")
         after = track(Recording.of_keypoints(found.rig, trial.keypoints), body)
-        old, new = agreement(shipped, before, trial.keypoints), agreement(found.rig, after, trial.keypoints)
-        print(f"# {detector}: shipped {old:.1f} px between cameras, {median_residual(before):.1f} px from the body")
-        figure(f"refine_residual_{detector}", new, "px", goal)
+        figure(f"refine_residual_{detector}", agreement(found.rig, after, trial.keypoints), "px", goal)
         figure(f"refine_body_residual_{detector}", median_residual(after), "px", goal)
         errors = held_out(Trial(trial.take, found.rig, trial.keypoints), after)
         outside = middle(np.concatenate([e.reshape(-1, 2) for e in errors.values()]))
-        lasting = middle(np.concatenate([(e - np.nanmedian(e, axis=0)).reshape(-1, 2) for e in errors.values()]))
-        shift = {name: np.nanmedian(e, axis=(0, 1)).round(1).tolist() for name, e in errors.items()}
-        print(f"# {detector}: held out {outside:.1f} px; the camera's own shift {shift} px")
-        print(f"# {detector}: held out without each keypoint's own constant in that view: {lasting:.1f} px")
         figure(f"refine_held_out_{detector}", outside / median_residual(after), "x", "<= 1.4")
-        high = f"{static_residual(shipped, HIGH):.1f} -> {static_residual(found.rig, HIGH):.1f}"
-        print(f"# {detector}: static points {static_residual(shipped):.1f} px before; those above 1.3 m {high} px")
         figure(f"refine_static_{detector}", static_residual(found.rig), "px", "<= 3")
         again = refine(good, trial.keypoints, body)
         figure(f"refine_static_from_good_{detector}", static_residual(again.rig), "px", "<= 3")
         figure(f"refine_seconds_{detector}", seconds, "s", "<= 20")
         alone = calibrate_people(tuple(shipped), trial.keypoints, body)
-        print(f"# {detector}: from people alone, static points {static_residual(alone.rig):.1f} px")
         figure(f"people_real_{detector}", distance_px(alone.rig, found.rig, found.motion), "px", "<= 6")
 
 
@@ -139,7 +128,7 @@ def synthetic() -> None:
     focal: list[float] = []
     clocks: list[float] = []
     body = load_body("humanoid")
-    for name, truth in library(amount([*MOTIONS, SHORT], ["jumping jacks 13_30"])).items():
+    for name, truth in library(amount(MOTIONS, ["jumping jacks 13_30"])).items():
         motion = cut(truth, 0, min(len(truth), _LONGEST))
         rig, centre = studio_rig(motion), motion.Ts_world_root[:, :3, 3].mean(axis=0)
         options = {"up": motion.up, "sigma": NOISE["noise_px"]}
@@ -154,8 +143,7 @@ def synthetic() -> None:
         late = [spoilt(delayed(k, f), random) for k, f in zip(exact, LATE, strict=True)]
         found = calibrate_people(tuple(rig), late, body, time_offsets=True, **options)
         clock = [abs(t * motion.rate - f) for t, f in zip(found.time_offsets.values(), LATE, strict=True)]
-        if name != SHORT:
-            turns, places, focal, clocks = turns + turn, places + place, focal + lens, clocks + clock[1:]
+        turns, places, focal, clocks = turns + turn, places + place, focal + lens, clocks + clock[1:]
         print(
             f"# {name}, {len(motion)} frames: rotation {np.round(turn, 3)} deg, position {np.round(place, 1)} mm, "
             f"focal length {np.round(lens, 2)} %, clocks {np.round(clock[1:], 3)} frames", flush=True,

@@ -19,13 +19,11 @@ from benchmarks.accuracy.video.posture_takes import Take, learnt, shown, takes, 
 from benchmarks.figures import figure
 from benchmarks.scenes.simulated import somebody, with_points_off
 from kinefit import Body, Motion, Recording, load_body, track
-from kinefit.geometry import se3
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.simulation.evaluation import angle_errors
 
 SET = "BODY_25B"
-ANGLES = {"hip flexion": ("hip_flexion_r", "hip_flexion_l"), "lumbar extension": ("lumbar_extension",),
-          "knee angle": ("knee_angle_r", "knee_angle_l")}  # fmt: skip
+ANGLES = {"hip flexion": ("hip_flexion_r", "hip_flexion_l"), "lumbar extension": ("lumbar_extension",)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +33,10 @@ class Told:
     Parameters
     ----------
     errors, sigmas : {angle: (F, k)} [deg]
-    tilt : (F,) [deg] error of the pelvis about its transverse axis
     """
 
     errors: dict[str, NDArray]
     sigmas: dict[str, NDArray]
-    tilt: NDArray
 
 
 def seen_by_detector(take: Take, number: int) -> Motion:
@@ -61,11 +57,7 @@ def told(truth: Motion, number: int, body: Body) -> Told:
     motion = track(Recording.of_keypoints(rig, seen, sigma=ACCURACY, up=truth.up), body)
     errors, std = angle_errors(truth, motion), np.degrees(motion.dof_std[:, 6:])
     at = {what: [body.tree.coordinate(c) for c in names] for what, names in ANGLES.items()}
-    R = truth.Ts_world_root[:, :3, :3]
-    turned = se3.log_so3(R.swapaxes(1, 2) @ motion.Ts_world_root[:, :3, :3])
-    return Told(
-        {w: errors[:, d] for w, d in at.items()}, {w: std[:, d] for w, d in at.items()}, np.degrees(turned[:, 2])
-    )
+    return Told({w: errors[:, d] for w, d in at.items()}, {w: std[:, d] for w, d in at.items()})
 
 
 def over_people(
@@ -83,14 +75,10 @@ def over_people(
 
 
 def run() -> None:
-    """Print what is learnt, and every figure before and after."""
+    """Print every figure before and after."""
     known = takes()
     absent = "the recordings are absent"
     several = len({t.person for t in known.values()}) > 3
-    if several:
-        rhythm = learnt(known)
-        weights = ", ".join(f"{n} {w:.2f}" for n, w in rhythm.weights.items())
-        print(f"# learnt of all: {weights}; {rhythm.offset:.1f} deg, spread {rhythm.spread:.1f} deg", flush=True)
     before, after, plain = {}, {}, uncoupled(load_body("humanoid"))
     for number, (name, take) in enumerate(known.items()):
         truth = seen_by_detector(take, number)
@@ -106,16 +94,8 @@ def run() -> None:
             tag = f"posture_{what.replace(' ', '_')}_{group}"
             print(f"# {group}, {what}: error {was[0]:.1f} deg, now {now[0]:.1f}; standard deviation {was[1]:.1f}, "
                   f"now {now[1]:.1f}; coverage {was[2]:.0f} %, now {now[2]:.0f} %", flush=True)  # fmt: skip
-            if what == "knee angle":
-                continue
             figure(f"{tag}_error", now[0] / was[0], "of before", "<= 0.5", absent)
             if what == "hip flexion":
                 figure(f"{tag}_sigma", now[1], "deg", "<= 8", absent)
                 figure(f"{tag}_coverage_lowest", now[2], "%", ">= 90", absent)
                 figure(f"{tag}_coverage_highest", now[2], "%", "<= 98", absent)
-        for told_as, of in (("", np.zeros_like), (" less a constant of the take", lambda e: np.full_like(e, e.mean()))):
-            tilts = [[np.abs(t.tilt - of(t.tilt)).mean() for n, t in r.items() if known[n].marked == marked]
-                     for r in (before, after)]  # fmt: skip
-            if there:
-                old, new = (float(np.mean(t)) for t in tilts)
-                print(f"# {group}, error of pelvic tilt{told_as}: {old:.1f} deg, now {new:.1f} deg", flush=True)

@@ -63,12 +63,11 @@ def real_trial(folder: Path) -> None:
     """Noise and residual on the real recording."""
     with tempfile.TemporaryDirectory() as where:
         trial = read_trial(folder, "openpose", Path(where))
-    causal, whole = (track(trial.recording, load_body("humanoid"), smooth=s) for s in (False, True))
+    whole = track(trial.recording, load_body("humanoid"))
     points, rate = rival_points(folder / RIVAL)
     rival = acceleration_noise(points, rate)
-    ours, before = (acceleration_noise(joint_centres(m), m.rate) for m in (whole, causal))
-    print(f"# above {ABOVE:g} Hz: rival {rival:.2f}, ours {ours:.2f}, frame by frame {before:.2f} m/s2")
-    print(f"# residual frame by frame {median_residual(causal):.2f} px")
+    ours = acceleration_noise(joint_centres(whole), whole.rate)
+    print(f"# above {ABOVE:g} Hz: rival {rival:.2f}, ours {ours:.2f} m/s2")
     figure("smooth_acceleration_noise", ours / rival, "x", "<= 0.5")
     figure("smooth_residual", median_residual(whole), "px", "<= 9")
 

@@ -49,15 +49,13 @@ POINTS: dict[str, dict[str, tuple[float, float]]] = {
     "elbow_left": {"cam01": (358.0, 575.4), "cam02": (331.5, 596.5), "cam03": (607.5, 590.8)},
     "elbow_right": {"cam01": (724.3, 606.0), "cam02": (724.3, 592.3), "cam04": (217.8, 729.2)},
 }
-HIGH = ("acromion_right", "elbow_left", "elbow_right")
-"""Those at 1.3 to 1.5 m above the platform; all others are below 0.35 m."""
 
 
-def residuals(rig: Rig, names: tuple[str, ...] | None = None) -> dict[str, dict[str, float]]:
+def residuals(rig: Rig) -> dict[str, dict[str, float]]:
     """{point: {camera: px}} from where the rig's own triangulation of the point puts it."""
     out = {}
-    for name in names or tuple(POINTS):
-        seen = {camera: uv for camera, uv in POINTS[name].items() if camera in rig}
+    for name, told in POINTS.items():
+        seen = {camera: uv for camera, uv in told.items() if camera in rig}
         if len(seen) < 2:
             continue
         uv = np.full((1, len(rig), 2), np.nan)
@@ -68,28 +66,6 @@ def residuals(rig: Rig, names: tuple[str, ...] | None = None) -> dict[str, dict[
     return out
 
 
-def static_residual(rig: Rig, names: tuple[str, ...] | None = None) -> float:
-    """Median [px] over all points (or those named) and all cameras that see them."""
-    return float(np.median([px for point in residuals(rig, names).values() for px in point.values()]))
-
-
-def main() -> None:
-    """Print the medians of the shipped and of the refined calibration."""
-    from benchmarks.figures import data
-    from kinefit.readers.calibration.read import read_calibration
-
-    folder = data("video_balancing_4cam")
-    if folder is None:
-        print("the recording video_balancing_4cam is absent")
-        return
-    low = tuple(name for name in POINTS if name not in HIGH)
-    for file in ("calibration/Calib.qca.txt", "Calib_refined_static.toml"):
-        rig = read_calibration(folder / file)
-        print(
-            f"{file}: {static_residual(rig):.2f} px, below 0.35 m {static_residual(rig, low):.2f} px, "
-            f"above 1.3 m {static_residual(rig, HIGH):.2f} px"
-        )
-
-
-if __name__ == "__main__":
-    main()
+def static_residual(rig: Rig) -> float:
+    """Median [px] over all points and all cameras that see them."""
+    return float(np.median([px for point in residuals(rig).values() for px in point.values()]))

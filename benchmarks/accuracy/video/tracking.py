@@ -23,7 +23,6 @@ from benchmarks.scenes.held_out import sides_right
 from benchmarks.scenes.motions import library
 from benchmarks.timing import took
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, load_observations, read_take, track
-from kinefit.geometry.lines import triangulate_robust
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.simulation.evaluation import angle_errors, coverage, joint_errors
 
@@ -84,21 +83,9 @@ def held_out(trial: Trial, whole: Motion) -> dict[str, NDArray]:
     return out
 
 
-def free_points_held_out(trial: Trial, whole: Motion) -> float:
-    """[px] the same with no body: every keypoint triangulated on its own from the other three cameras."""
-    uv = np.stack([whole.residuals[n].measured for n in trial.rig.names], axis=2)
-    out = []
-    for c, camera in enumerate(trial.rig):
-        others = uv.copy()
-        others[:, :, c] = np.nan
-        x, _, _ = triangulate_robust(trial.rig, others.reshape(-1, len(trial.rig), 2), max_residual_px=40.0)
-        out.append(np.linalg.norm(camera.project(x) - uv[:, :, c].reshape(-1, 2), axis=-1))
-    return float(np.nanmedian(out))
-
-
-def wall(trial: Trial, *, smooth: bool) -> float:
-    """Seconds from keypoints to motion, once the kernels are there."""
-    return took(lambda: track(trial.recording, load_body("humanoid"), smooth=smooth), clock=time.perf_counter)[1]
+def wall(trial: Trial) -> float:
+    """Seconds from keypoints to motion frame by frame, once the kernels are there."""
+    return took(lambda: track(trial.recording, load_body("humanoid"), smooth=False), clock=time.perf_counter)[1]
 
 
 def middle(errors: NDArray) -> float:
@@ -111,8 +98,7 @@ def real_trial(folder: Path, where: Path) -> None:
     for detector in amount(DETECTORS, DETECTORS[-1:]):
         trial = read_trial(folder, detector, where)
         motion = track(trial.recording, load_body("humanoid"))
-        seconds = min(wall(trial, smooth=False) for _ in range(amount(5, 1)))
-        whole = min(wall(trial, smooth=True) for _ in range(amount(3, 1)))
+        seconds = min(wall(trial) for _ in range(amount(5, 1)))
         residual = median_residual(motion)
         per_camera = {name: round(float(np.nanmedian(r.norms)), 1) for name, r in motion.residuals.items()}
         swaps = {name: int(r.swapped.sum()) for name, r in motion.residuals.items()}
@@ -121,12 +107,9 @@ def real_trial(folder: Path, where: Path) -> None:
         errors = held_out(trial, motion)
         shifts = {n: np.nanmedian(e, axis=(0, 1)) for n, e in errors.items()}
         outside = middle(np.concatenate([e.reshape(-1, 2) for e in errors.values()]))
-        unshifted = middle(np.concatenate([(e - shifts[n]).reshape(-1, 2) for n, e in errors.items()]))
         per_camera = {n: round(middle(e), 1) for n, e in errors.items()}
         constant = {n: s.round(1).tolist() for n, s in shifts.items()}
-        free = free_points_held_out(trial, motion)
         print(f"# {detector}: held out {per_camera} px, of that a constant shift of {constant} px")
-        print(f"# {detector}: held out without those shifts {unshifted:.1f} px; free points, no body: {free:.1f} px")
         figure(f"video_held_out_{detector}", outside, "px", f"<= {1.5 * GOALS[detector]:g}")
         figure(f"video_held_out_ratio_{detector}", outside / residual, "x", "<= 1.5")
         figure(f"video_frames_tracked_{detector}", float((motion.quality > 0.3).sum()), "frames", FRAMES)
@@ -134,7 +117,6 @@ def real_trial(folder: Path, where: Path) -> None:
         lengths = np.linalg.norm(joints[:, 1:] - joints[:, motion.body.tree.parents[1:]], axis=2)
         figure(f"video_bone_length_change_{detector}", 1e3 * float(np.ptp(lengths, axis=0).max()), "mm", "<= 0.001")
         figure(f"video_speed_{detector}", len(motion) / seconds, "frames/s", ">= 300")
-        print(f"# {detector}: smoothed, its strength estimated: {len(motion) / whole:.0f} frames/s")
         if detector == "mediapipe":
             cam02 = None if quick() else float(swaps["cam02"])
             figure("video_swaps_cam02", cam02, "frames", ">= 26", LEFT_OUT)
@@ -194,8 +176,6 @@ def synthetic(keypoint_set: str) -> None:
             f"# {keypoint_set} {name}: {joints[-1]:.1f} mm, {angles[-1]:.2f} deg, within 2 sigma: "
             f"{100 * inside[-1].joints:.0f} % of joints, {100 * inside[-1].angles:.0f} % of angles", flush=True,
         )  # fmt: skip
-    if sure:
-        print(f"# {keypoint_set}: angles whose own standard deviation is below 10 deg: {np.mean(sure):.2f} deg")
     absent = "the recorded motions are absent"
     tag = keypoint_set.lower()
     count = None if quick() else float(len(joints)) or None

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import amount, figure, quick
+from benchmarks.figures import amount, figure
 from benchmarks.papers.markers.synthetic_points import random_pose, synthetic_body
 from benchmarks.scenes.marker_takes import counts
 from benchmarks.timing import timed
@@ -90,8 +90,8 @@ def table(model: MarkerModel) -> None:
     figure("markers_synthetic_median_worst", max(medians), "ms", "<= 100")
 
 
-def surface(model: MarkerModel, file: Path | None) -> None:
-    """Labels right over distortion and rotation (P5 Fig. 3)."""
+def surface(model: MarkerModel, file: Path) -> None:
+    """Draw labels right over distortion and rotation (P5 Fig. 3)."""
     distortions, rotations = np.arange(0, 11, 2) / 100, np.arange(0, 5)
     poses = max(POSES // 10, 5)
     found = {
@@ -101,12 +101,7 @@ def surface(model: MarkerModel, file: Path | None) -> None:
         ]
         for name, method in (("identify", ours), ("SAPM", sapm))
     }
-    for name, rows in found.items():
-        print(f"{name}: labels right; distortion " + " ".join(f"{d:6.0%}" for d in distortions))
-        for r, row in zip(rotations, rows):
-            print(f"  rotation 0-{r} rad  " + " ".join(f"{v:6.1%}" for v in row), flush=True)
-    if file is not None:
-        file.write_text(drawing(found, distortions, rotations), "utf-8")
+    file.write_text(drawing(found, distortions, rotations), "utf-8")
 
 
 def drawing(found: dict[str, list[list[float]]], distortions: NDArray, rotations: NDArray) -> str:
@@ -154,7 +149,7 @@ def run(file: Path | None = None) -> None:
     print(f"# SAPM, rigid, 20 % missing: {firm.right:.1%} right at ε 0.02, β 0.5; {loose.right:.1%} at ε 0.1, β 0.8")
     figure("markers_synthetic_sapm_rigid", 100 * firm.right, "% right", f">= {100 * loose.right:.1f}")
     table(model)
-    if not quick():
+    if file is not None:
         surface(model, file)
 
 

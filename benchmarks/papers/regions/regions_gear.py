@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.closures.closures_people import gap, joints, left, own_circle, rms, true_circle
-from benchmarks.accuracy.closures.closures_takes import Take
+from benchmarks.accuracy.closures.closures_people import gap, joints, left, own_circle, rms
 from benchmarks.figures import LEFT_OUT, ROOT, amount, figure, quick
 from benchmarks.papers.regions.gear_takes import GearTake, rendered_cyclist, rendered_snowboarder
 from benchmarks.scenes.curves import COLOURS, curves
@@ -26,7 +25,6 @@ from kinefit.bodies.motion import Motion
 from kinefit.bodies.rendering import Canvas, render_body
 from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.geometry.camera import Camera
-from kinefit.images.silhouette import BackgroundPlate
 from kinefit.takes.track import track_take
 
 SEEDS = (11, 12)
@@ -111,14 +109,7 @@ def pedals(whole: Sequence[Followed], hidden: Sequence[Followed]) -> None:
     """How far both cleats' paths are from circles."""
     for key, takes in _kinds(whole, hidden):
         figure(f"cyclist_regions{key}_pedal", rms([own_circle(f.closed) for f in takes]), "mm RMS", "<= 2")
-        worlds = [rms([true_circle(_as_take(f), m) for f, m in pairs]) for pairs in (
-            [(f, f.closed) for f in takes], [(f, f.loose) for f in takes])]  # fmt: skip
-        print(f"  without closures: {rms([own_circle(f.loose) for f in takes]):.1f} mm; from the true circle "
-              f"{worlds[0]:.1f} mm with closures, {worlds[1]:.1f} mm without")  # fmt: skip
-
-
-def _as_take(f: Followed) -> Take:
-    return Take(f.take.truth, f.take.truth.body, None, f.take.hidden)  # type: ignore[arg-type]
+        print(f"  without closures: {rms([own_circle(f.loose) for f in takes]):.1f} mm")
 
 
 def boots(whole: Sequence[Followed], hidden: Sequence[Followed]) -> None:
@@ -130,14 +121,12 @@ def boots(whole: Sequence[Followed], hidden: Sequence[Followed]) -> None:
 
 
 def subtraction(f: Followed) -> None:
-    """Overlap with the true silhouette of rider and board: plain subtraction, the product's plate, the tracked body."""
+    """Overlap of plain subtraction with the true silhouette of rider and board."""
     scene, chosen = f.take.scene, range(0, len(f.take.scene), amount(8, 3))
     count = len(f.take.truth.body.tree.segments)
-    gear = f.take.truth.body.gear_scale[f.take.truth.body.segment_scale]
-    plain, plate, fitted = {t: list[float]() for t in THRESHOLDS}, list[float](), list[float]()
+    plain = {t: list[float]() for t in THRESHOLDS}
     for camera in scene.rig:
         empty, canvas = scene.empty(camera), Canvas(camera.size)
-        own = BackgroundPlate(empty)
         for i, image in zip(chosen, scene.images(camera, chosen)):
             mesh = scene.moving.mesh
             raster = canvas.draw_for(camera, scene.moving.posed(i), mesh.faces, cull=True, labels=mesh.face_segment)
@@ -145,13 +134,8 @@ def subtraction(f: Followed) -> None:
             away = np.abs(image.astype(int) - empty).max(axis=2)
             for t in THRESHOLDS:
                 plain[t].append(_iou(_largest(away > t), rider))
-            plate.append(_iou(own.mask(image) > 0, rider))
-            person = rider & ~np.append(gear, False)[np.where(rider, raster.segment, -1)]
-            fitted.append(_iou(drawn(f.closed, i, camera), person))
     best = max(THRESHOLDS, key=lambda t: np.mean(plain[t]))
     figure("snowboarder_subtraction_iou", float(np.mean(plain[best])), "", "<= 0.7")
-    print(f"  by the best of {len(THRESHOLDS)} thresholds, {best} grey levels; a plate with shadows left out "
-          f"{np.mean(plate):.2f}; the body by regions, with the person alone, {np.mean(fitted):.2f}")  # fmt: skip
 
 
 def _largest(mask: NDArray) -> NDArray:

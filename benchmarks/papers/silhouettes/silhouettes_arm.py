@@ -7,7 +7,6 @@ turned about its axis tried; the rest is silhouettes alone, forwards and backwar
 
 from __future__ import annotations
 
-import os
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -181,20 +180,3 @@ def run() -> None:
     told = np.array([overlap(fit.body, states[i], rig, pictures(i)) for i in sorted(states)])
     figure("arm and hand: mean overlap with the silhouettes", told.mean(), "IoU", ">= 0.8")
     figure(name, float((told.min(axis=1) >= 0.7).sum()), "frames", ">= 300")
-    if os.environ.get("KINEFIT_PICTURES"):
-        _draw(fit.body, states, rig, pictures, Path(os.environ["KINEFIT_PICTURES"]) / "silhouettes_arm.png")
-
-
-def _draw(body: Body, states: dict[int, BodyState], rig: Rig, pictures: Pictures, path: Path) -> None:
-    rows, mesh = [], body_mesh(body)
-    for camera, video in zip(rig, pictures.videos):
-        row = []
-        for i in range(FIRST, LAST, 60):
-            small = scaled(camera, 0.5)
-            image = cv2.resize(video.read(i), small.size, interpolation=cv2.INTER_AREA)[..., ::-1].copy()
-            segment = render_body(body, states[i], small, mesh=mesh).segment
-            edge = (segment != np.roll(segment, 1, 0)) | (segment != np.roll(segment, 1, 1))
-            image[edge] = (0, 255, 0)
-            row.append(image)
-        rows.append(np.hstack(row))
-    cv2.imwrite(str(path), np.vstack(rows))

@@ -1,60 +1,48 @@
-"""Inputs that users reported: how many are answered rightly, how many siblings of each, and false alarms on right ones.
-
-An answer is right where the value is, or where the error or the note names what is wrong. Each case goes through the
-command or the public function that a user calls, with its defaults.
-"""
+"""OpenSim's inverse kinematics on what `kinefit markers fit` writes, beside kinefit's own fit, for every marker set."""
 
 from __future__ import annotations
 
 import tempfile
-import traceback
-from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from benchmarks.figures import amount, figure, module_of, recording
+import numpy as np
 
-MODULES = ("markers", "calibration", "skeletons", "pictures", "sides")
-"""Modules `faults_users_*` with CASES and SIBLINGS: {name: whether the answer to what lies in a folder is right}."""
+from benchmarks.figures import LEFT_OUT, amount, figure, peers, quick
+from benchmarks.peers.environments import run_peer
+from kinefit.bodies import PointSet
+from kinefit.bodies.marker_sets import placed_set_names, placement
+from kinefit.cli.markers._fit import fit_file
+from kinefit.exporters import write_markers
+from kinefit.observations import Markers
+from kinefit.simulation import squat_and_wave
 
-KINDS = ("bvh", "c3d", "calibration", "keypoints", "markers", "openpose", "trc", "video-avi", "video-mirrored")
-"""Begins of the names of the cases that these modules answer."""
 
-Answer = Callable[[Path], bool]
+def write_take(path: Path, name: str) -> None:
+    """A squat with a marker set, each marker 8 mm and 2 mm of noise off the set's place along each axis."""
+    truth, rng = squat_and_wave(rate=float(amount(15, 5))), np.random.default_rng(0)
+    points = placement(truth.body, name).points
+    away = rng.normal(scale=0.008, size=(len(points), 3))
+    x = truth.positions(PointSet(points.names, points.segments, points.points + away))
+    x = x + rng.normal(scale=0.002, size=x.shape)
+    write_markers(Markers(points.names, truth.rate, x, up=truth.up), path)
 
 
 def run() -> None:
-    """Print the shares, and the names of what is wrong."""
-    modules = [module_of(f"faults_users_{name}") for name in MODULES]
-    siblings = {name: answer for module in modules for name, answer in module.SIBLINGS.items()}
-    siblings = dict(list(siblings.items())[: amount(None, 4)])
-    with tempfile.TemporaryDirectory() as folder:
-        for number in range(len(siblings)):
-            (Path(folder) / str(number)).mkdir()
-        folders = {name: Path(folder) / str(number) for number, name in enumerate(siblings)}
-        right = _right(siblings, folders)
-    figure("faults_users_siblings", 100 * right / len(siblings), f"% of {len(siblings)}", "== 100")
-    root = recording("cases_of_users")
-    cases = {name: answer for module in modules for name, answer in module.CASES.items()}
-    folders = {path.name: path for path in sorted(root.iterdir()) if path.is_dir() and path.name.startswith(KINDS)}
-    missing = sorted(folders.keys() - cases.keys())
-    print(f"# no answer is looked at: {', '.join(missing)}" if missing else f"# {len(folders)} cases", flush=True)
-    right = _right({name: cases[name] for name in list(folders)[: amount(None, 4)] if name in cases}, folders)
-    figure("faults_users_cases", 100 * right / amount(len(folders), 4), f"% of {amount(len(folders), 4)}", "== 100")
-    for module in modules:
-        if hasattr(module, "run"):
-            module.run()
-
-
-def _right(answers: Mapping[str, Answer], folders: Mapping[str, Path]) -> int:
-    """How many are right; a case that ends in an exception is wrong, and is shown."""
-    count = 0
-    for name, answer in answers.items():
-        try:
-            is_right = answer(folders[name])
-        except Exception:
-            traceback.print_exc(limit=3)
-            is_right = False
-        if not is_right:
-            print(f"# wrong: {name}", flush=True)
-        count += is_right
-    return count
+    """Print how far OpenSim's marker error is from kinefit's, worst of all marker sets."""
+    worst, reason = None, ""
+    with tempfile.TemporaryDirectory() as place:
+        folder, own = Path(place), {}
+        for name in placed_set_names():
+            write_take(folder / f"{name}.trc", name)
+            formats = ("mot", "osim", "markers")
+            ((motion, _),) = fit_file(folder / f"{name}.trc", folder / name, formats=formats).values()
+            own[name] = 1e3 * float(np.sqrt(np.mean(motion.residuals["markers"].norms ** 2)))
+        left_out = {"reason": LEFT_OUT if quick() else "--no-peers"}
+        found = run_peer("opensim_sets", folder) if peers() else left_out
+        reason = found.get("reason", "")
+        if not reason:
+            apart = {n: [abs(found[n][key] - own[n]) for key in ("rms_mm", "own_angles_mm")] for n in own}
+            for name, (solved, same) in apart.items():
+                print(f"# {name}: {own[name]:.2f} mm; OpenSim off by {solved:.2f}, at kinefit's angles {same:.4f}")
+            worst = max(map(max, apart.values()))
+    figure("faults_users_osim_rms", worst, "mm", "<= 0.5", reason)

@@ -781,6 +781,7 @@ def test_one_depth_image_is_a_take_of_one_pose(folder):
 @pytest.mark.parametrize(("name", "size", "focal", "sure"), [
     ("D435i session", (848, 480), 425.0, "likely"), ("kinect_v2", (512, 424), 365.0, "likely"),
     ("Kinect", (640, 480), 577.0, "likely"), ("femto bolt", (640, 576), 504.0, "likely"),
+    ("astra", (640, 480), 570.0, "likely"), ("depth", (640, 576), 504.0, "guess"),
     ("depth", (512, 424), 365.0, "guess"), ("depth", (640, 480), None, "open"), ("depth", (200, 100), None, "open"),
 ])  # fmt: skip
 def test_the_lens_of_a_depth_camera_is_guessed_by_name_and_size(folder, name, size, focal, sure):

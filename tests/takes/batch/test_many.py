@@ -66,6 +66,7 @@ def test_the_same_with_one_worker_with_two_and_after_a_kill(sessions, tmp_path):
     assert track_takes(pattern, tmp_path / "two", choices=CHOICES, workers=2) == rows
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
     words = ["batch", pattern, "--out", str(tmp_path / "killed"), "--no-overlays", "--no-report", "--realtime"]
+    words += ["--workers", "2"]
     command = [sys.executable, "-m", "kinefit", *words, "--formats", "motion,csv"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     first = tmp_path / "killed" / "s01" / "post" / "take-kinefit" / RECORD
