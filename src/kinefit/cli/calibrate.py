@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -131,6 +131,15 @@ def _tell(result: BoardCalibration) -> None:
 _RESIDUAL_SCALE = 200  # a residual of 0.1 px is drawn 20 px long
 
 
+def _length(length: float, length_sigma: float | None) -> tuple[float, float]:
+    """Length of a bar and its standard deviation [m], checked."""
+    from kinefit.rigs.bar.calibrate import LENGTH_SIGMA, check_bar
+
+    sigma = LENGTH_SIGMA if length_sigma is None else length_sigma
+    check_bar(length, sigma)
+    return length, sigma
+
+
 @calibrate.command(short_help="Intrinsics, poses and scale from a bar with two targets.", epilog="""\b
 Examples:
   kinefit calibrate bar videos/ --length 0.9
@@ -151,9 +160,11 @@ Examples:
               help="Frames of each camera to search, spread over the recording.")
 @click.option("--overwrite", is_flag=True, help="Overwrite an existing OUT.")
 @_screen.verbose_option
+@_screen.gathered("length", _length, "length", "length_sigma")
+@_screen.gathered("images", dict, "size", "max_frames")
 def bar(
-    sources: tuple[Path, ...], length: float, length_sigma: float | None, out: Path, interiors: Path | None,
-    floor: str | None, distance: str | None, size: str | None, max_frames: int, overwrite: bool,
+    sources: tuple[Path, ...], length: tuple[float, float], out: Path, interiors: Path | None, floor: str | None,
+    distance: str | None, images: dict[str, Any], overwrite: bool,
 ) -> None:
     """Intrinsics, camera poses and scale from a bar with two bright targets, waved through the volume.
 
@@ -161,21 +172,18 @@ def bar(
     frame numbers mean equal times. Or give a CSV file of centroids: camera,frame,u,v, with two rows for each image.
     """
     from kinefit.readers.calibration.read import read_calibration, write_calibration
-    from kinefit.rigs.bar.calibrate import LENGTH_SIGMA, calibrate_bar, check_bar
+    from kinefit.rigs.bar.calibrate import calibrate_bar
 
-    sigma = LENGTH_SIGMA if length_sigma is None else length_sigma
-    check_bar(length, sigma)
     on_floor, known = _frames(floor), _distance(distance)
     written = [out, out.with_suffix(".csv"), out.with_suffix(".png")]
     for file in written:
         _screen.check_new(file, overwrite)
     kept = read_calibration(interiors, exteriors=False) if interiors else None
     with _screen.bars() as step:
-        seen = _seen(sources, size, kept, max_frames, on_floor, step)
+        seen = _seen(sources, kept, on_floor, step, **images)
         step("calibrating", 0, 1)
         result = calibrate_bar(
-            seen, length, interiors=kept, floor=on_floor, known_distance=known,
-            length_sigma=sigma,
+            seen, length[0], interiors=kept, floor=on_floor, known_distance=known, length_sigma=length[1],
         )  # fmt: skip
         step("calibrating", 1, 1)
     write_calibration(result.rig, out)
@@ -186,8 +194,8 @@ def bar(
 
 
 def _seen(
-    sources: tuple[Path, ...], size: str | None, kept: object, max_frames: int, include: tuple[int, ...],
-    step: _screen.Step,
+    sources: tuple[Path, ...], kept: object, include: tuple[int, ...], step: _screen.Step, *, size: str | None,
+    max_frames: int,
 ) -> dict[str, BarViews]:
     from kinefit.geometry.camera import Rig
     from kinefit.rigs.bar.calibrate import check_cameras

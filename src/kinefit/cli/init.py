@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,21 @@ if TYPE_CHECKING:
     from kinefit.readers.take.load import Observations
 
 _COLOURS = {"sure": "green", "likely": "cyan", "guess": "yellow", "open": "bold red"}
+
+
+def _joint_clicks(
+    clicked: bool, points: Path | None, step: int | None, body: str | None, browser: bool
+) -> Callable[[Path], None] | None:
+    """Write the first pose into a take file, from joints that are clicked or stand in a file; None without them."""
+    if clicked and points is not None:
+        raise click.UsageError("--click and --points exclude each other: give one.")
+    if step is not None and not clicked:
+        raise click.UsageError("--step needs --click; a file of --points has its own step.")
+    if body is not None and not (clicked or points):
+        raise click.UsageError("--body needs --click or --points; without them, write body into the take file.")
+    if not clicked and points is None:
+        return None
+    return lambda out: start_from_clicks(out, points, step, body or "humanoid", browser)
 
 
 @click.command(short_help="Write a take file for the recording in a folder.", epilog="""\b
@@ -42,9 +57,9 @@ Examples:
 )
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page of --click.")
 @_screen.verbose_option
+@_screen.gathered("click_joints", _joint_clicks, "clicked", "points", "step", "body", "browser")
 def init(
-    folder: Path, out: Path | None, force: bool, clicked: bool, points: Path | None, step: int | None,
-    body: str | None, browser: bool, hide_faces: bool,
+    folder: Path, out: Path | None, force: bool, click_joints: Callable[[Path], None] | None, hide_faces: bool
 ) -> None:
     """Write a take file for the recording in FOLDER: calibration, videos, keypoints, markers.
 
@@ -52,12 +67,6 @@ def init(
     a comment in the file. Check the lines marked guess or open, then run kinefit check. No other file is changed; with
     --hide-faces, copies of the videos are written next to the take file.
     """
-    if clicked and points is not None:
-        raise click.UsageError("--click and --points exclude each other: give one.")
-    if step is not None and not clicked:
-        raise click.UsageError("--step needs --click; a file of --points has its own step.")
-    if body is not None and not (clicked or points):
-        raise click.UsageError("--body needs --click or --points; without them, write body into the take file.")
     from kinefit._files import write_text
     from kinefit.readers.guess.folder import guess_take
 
@@ -76,8 +85,8 @@ def init(
         with _screen.bars() as progress:
             copies = hide_in_copies(out, progress, _screen.note)
         _screen.say(f"{len(copies)} copies with blurred faces: {copies[0].parent}. The originals are unchanged.")
-    if clicked or points is not None:
-        start_from_clicks(out, points, step, body or "humanoid", browser)
+    if click_joints is not None:
+        click_joints(out)
     asked = any(note.about == "rate" and note.sure == "open" for note in guess.notes)
     alone = any(note.about == "cameras" and note.sure == "open" for note in guess.notes)
     bare = any(note.about == "intrinsics" and note.sure == "open" for note in guess.notes)

@@ -51,7 +51,7 @@ class Refined:
         return [*lines, *(alignment_line(fit) for fit in self.sensors)]
 
 
-def refined_of(found: Checked, step: Step, points: Path | None, **lenses_and_clocks: Any) -> Refined:
+def refined_of(found: Checked, step: Step, *, points: Path | None, **lenses_and_clocks: Any) -> Refined:
     """The cameras with keypoints refined, and other sensors against them.
 
     Where other sensors do not fit and the cameras have no fault, the cameras stay: a person's few steps place a sensor

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -42,9 +42,10 @@ _PRINTED = ("camera", "bias u, v [px]", "±", "spread", "late [frames]", "left/r
 @click.option("--strict", is_flag=True, help="End with exit code 2 if there is a fault.")
 @_screen.quiet_options
 @_screen.verbose_option
+@_screen.gathered("also", dict, "focal", "distortion", "time_offsets", "points")
 def check(
-    take: Path, out: Path | None, refine: bool, focal: bool, distortion: bool, time_offsets: bool,
-    points: Path | None, fix: bool, strict: bool, hide_faces: bool, as_json: bool,
+    take: Path, out: Path | None, refine: bool, also: dict[str, Any], fix: bool, strict: bool, hide_faces: bool,
+    as_json: bool,
 ) -> None:  # fmt: skip
     """Find faults of a recording, with their confidence and how to correct them.
 
@@ -52,10 +53,10 @@ def check(
     of the cameras, their clocks, images scaled or letterboxed after the calibration, left and right, floor and
     vertical, the view of each camera, and whether depth cameras and marker systems fit the videos.
     """
-    if (focal or distortion or time_offsets or points) and not refine:
+    if any(also.values()) and not refine:
         raise click.UsageError("--focal, --distortion, --time-offsets and --points need --refine.")
-    if points is not None and not points.is_file():
-        raise click.BadParameter(f"no such file: {points}", param_hint="--points")
+    if also["points"] is not None and not also["points"].is_file():
+        raise click.BadParameter(f"no such file: {also['points']}", param_hint="--points")
     from kinefit._files import write_text
     from kinefit.cli.checks._page import check_page
     from kinefit.cli.checks._refine import refined_of, write_refined
@@ -82,7 +83,7 @@ def check(
                 found, content = _checked(take, hide_faces, step)
         if refine and failed is None:
             try:
-                refined = refined_of(found, step, points, focal=focal, distortion=distortion, time_offsets=time_offsets)
+                refined = refined_of(found, step, **also)
             except KinefitError as error:
                 failed = error
     if fixed:

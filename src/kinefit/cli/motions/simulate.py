@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -162,6 +163,11 @@ def _frames(ctx: click.Context, parameter: click.Parameter, value: str | None) -
         raise click.BadParameter("give FIRST:LAST, without the frame LAST.") from None
 
 
+def _place(azimuth: float, no_room: bool, **others: Any) -> dict[str, Any]:
+    """Where the sensors stand, and the room and the seed, as `write_recording` has them."""
+    return {"azimuth": math.radians(azimuth), "room": not no_room, **others}
+
+
 @click.command(short_help="Simulate depth, stereo and colour cameras for a motion.", epilog="""\b
 Examples:
   kinefit simulate walk.bvh -o walk --sensor kinect
@@ -185,17 +191,15 @@ Examples:
 @click.option("--no-room", is_flag=True, help="Leave out floor, walls and table.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all noise.")
 @_screen.verbose_option
+@_screen.gathered("place", _place, "distance", "azimuth", "height", "no_room", "seed")
 def simulate(
     motion: Path, out: Path, sensors: tuple[str, ...], body: str | None, asf: Path | None, rate: float | None,
-    frames: tuple[int, int | None] | None, distance: float | None, azimuth: float, height: float, no_room: bool,
-    seed: int,
+    frames: tuple[int, int | None] | None, place: dict[str, Any],
 ) -> None:  # fmt: skip
     """Simulate the sensors in front of a person who performs MOTION (.npz of kinefit, .bvh or .amc).
 
     The folder gets a take for kinefit track, and the true motion in truth/.
     """
-    import math
-
     from kinefit.exporters import write_csv, write_motion
     from kinefit.simulation import cut, write_recording
 
@@ -209,8 +213,8 @@ def simulate(
             write_csv(known, folder / "truth")
 
         take = write_recording(
-            known, out, sensors, distance=distance, azimuth=math.radians(azimuth), height=height, room=not no_room,
-            seed=seed, step=step, beside=truth, body=Path(body).resolve() if body and body.endswith(".toml") else None,
+            known, out, sensors, **place, step=step, beside=truth,
+            body=Path(body).resolve() if body and body.endswith(".toml") else None,
         )  # fmt: skip
     _screen.say(f"{take}: {len(known)} frames at {known.rate:g} Hz of the body {known.body.name}")
     _screen.say(f"{out / 'truth'}: the true motion (motion.npz, joints.csv and more)")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from kinefit.cli import _screen
 from kinefit.errors import command
 
 if TYPE_CHECKING:
+    from kinefit.studio.live.receivers.websocket import WebSockets
     from kinefit.studio.live.session import LiveSession, Receiver
 
 
@@ -25,6 +27,30 @@ def _address(ctx: click.Context, parameter: click.Parameter, value: str | None) 
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise click.BadParameter(f"{value!r} is not HOST:PORT; write it as localhost:39539")
     return host.strip("[]"), int(port)
+
+
+def _page(page: bool, port: int, host: str, token: str | None) -> Callable[..., WebSockets] | None:
+    """What serves the page, given its title and what it may ask the session; None without a page."""
+    from kinefit.studio.live.receivers.websocket import WebSockets
+
+    return partial(WebSockets, port, host=host, token=token) if page else None
+
+
+def _receivers(
+    lines: str | None, vmc: tuple[str, int] | None, lsl: str | None
+) -> Callable[[float, str], Iterator[Receiver]]:
+    """What opens the receivers that are asked for, one after the other, given the rate [Hz] and the vertical axis."""
+    from kinefit.studio.live.receivers import websocket
+
+    def opened(rate: float, up: str) -> Iterator[Receiver]:
+        if lines is not None:
+            yield websocket.JsonLines(lines)
+        if vmc is not None:
+            yield websocket.Vmc(*vmc, up=up)
+        if lsl is not None:
+            yield websocket.Lsl(lsl, rate=rate)
+
+    return opened
 
 
 @click.command(short_help="Track a person live, and stream the poses.", epilog="""\b
@@ -52,9 +78,11 @@ Examples:
     "--record/--no-record", default=True, show_default=True, help="Write the motion and a take into the folder."
 )
 @_screen.verbose_option
+@_screen.gathered("serve", _page, "page", "port", "host", "token")
+@_screen.gathered("send", _receivers, "lines", "vmc", "lsl")
 def live(
-    take: Path, out: Path | None, page: bool, port: int, host: str, token: str | None, vmc: tuple[str, int] | None,
-    lsl: str | None, lines: str | None, speed: float, seconds: float | None, record: bool,
+    take: Path, out: Path | None, serve: Callable[..., WebSockets] | None,
+    send: Callable[[float, str], Iterator[Receiver]], speed: float, seconds: float | None, record: bool,
 ) -> None:
     """Track a person live, and stream the poses.
 
@@ -68,25 +96,23 @@ def live(
     """
     from kinefit.readers.take.file import read_take
     from kinefit.simulation.recordings import warm_depth, warm_keypoints
-    from kinefit.studio.live.receivers import websocket
     from kinefit.studio.live.record import MotionRecord
     from kinefit.studio.live.take import folder_of, live_session
 
     entry = read_take(take)
-    quiet = lines == "-"
+    quiet = click.get_current_context().params["lines"] == "-"
     receivers: list[Receiver] = []
     folder = (out or folder_of(entry)) if record else None
     session: LiveSession = live_session(entry, speed=speed, folder=folder, tell=_screen.note)
     try:
         rate, up = session.tracker.rate, entry.up
-        receivers += [] if lines is None else [websocket.JsonLines(lines)]
-        receivers += [] if vmc is None else [websocket.Vmc(*vmc, up=up)]
-        receivers += [] if lsl is None else [websocket.Lsl(lsl, rate=rate)]
+        for receiver in send(rate, up):
+            receivers.append(receiver)
         kept = None if folder is None else MotionRecord(folder, rate=rate, up=up, name=entry.name)
         if kept is not None:
             receivers.append(kept)
-        if page:  # the last: its thread, once it has a pose, takes its turns with whoever is still to get it
-            served = websocket.WebSockets(port, host=host, token=token, title=entry.name, ask=session.ask)
+        if serve is not None:  # the last: once it has a pose, its thread takes turns with who is still to get it
+            served = serve(title=entry.name, ask=session.ask)
             receivers.append(served)
             if served.access.warning:
                 _screen.note(f"warning: {served.access.warning}")
