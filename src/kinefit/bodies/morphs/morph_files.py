@@ -1,19 +1,16 @@
-"""Read and write `[[morph]]` of a body file: shape changes that depend on angles."""
+"""Read `[[morph]]` of a body file: shape changes that depend on angles."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
 
 from kinefit._files import metres_of
 from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph, Steering
-from kinefit.bodies.surfaces.cylinder import TaperedCylinder
 from kinefit.bodies.surfaces.files import SurfaceRecord, surfaces_of
 from kinefit.bodies.surfaces.mesh import read_obj
 from kinefit.bodies.tree import KinematicTree
@@ -127,50 +124,3 @@ def _joint_motion(record: MorphRecord, segment: str, tree: KinematicTree, steeri
     R = se3.exp_so3(np.radians(record.turn or (0.0, 0.0, 0.0)))
     xi = se3.log(se3.transform(R, np.array(record.shift or (0.0, 0.0, 0.0))))
     return JointMotion(segment, se3.adjoint(se3.transform(np.eye(3), tree.rest[s])) @ xi, steering)
-
-
-def format_morphs(morphs: Sequence[Operator], tree: KinematicTree) -> str:
-    """Format morphs as `[[morph]]` entries of a body file; empty without morphs.
-
-    Raises
-    ------
-    BodyError
-        A weighting by a function, or a target of nodes or meshes, which a file cannot contain.
-    """
-    return "\n".join(_entry(morph, tree) for morph in morphs)
-
-
-def _entry(morph: Operator, tree: KinematicTree) -> str:
-    s = morph.steering
-    degrees = 1.0 if tree.prismatic[tree.coordinate(s.coordinate)] else 180.0 / math.pi
-    if callable(s.weight):
-        raise BodyError("a file cannot hold a weighting by a function", remedy="Give a table of t and ω.")
-    if isinstance(morph, JointMotion):
-        T = se3.exp(se3.adjoint(se3.transform(np.eye(3), -tree.rest[tree.segment(morph.segment)])) @ morph.twist)
-        own = {"kind": "joint", "segment": morph.segment, "shift": T[:3, 3], "turn": np.degrees(se3.log(T)[3:])}
-    elif isinstance(morph, LocalMorph):
-        own = {"kind": "local"} | {name: getattr(morph, name) for name in ("centre", "radii", "shift")}
-        own |= {"segment": morph.segment or tree.segments[0], "on": morph.on or None, "moves": morph.moves}
-        own |= {"tilt": np.degrees(morph.tilt), "turn": np.degrees(morph.turn), "stretch": morph.stretch}
-    elif isinstance(morph, SegmentMorph):
-        if not all(isinstance(c, TaperedCylinder) for c in morph.surfaces):
-            remedy = "Name its OBJ file in the body file."
-            raise BodyError("a body file cannot hold a morph to a mesh", remedy=remedy)
-        own = {"kind": "surface", "segment": morph.segment, "surface": [vars(c) for c in morph.surfaces]}
-    else:
-        remedy = "Write the nodes to an OBJ file, and name that as `target`."
-        raise BodyError("a body file cannot hold a morph to single nodes", remedy=remedy)
-    own |= {"angle": s.coordinate, "start": s.start * degrees, "end": s.end * degrees, "weight": s.weight}
-    own |= {"beyond": s.beyond}
-    lines = [f"{key} = {_toml(value)}" for key, value in own.items() if value is not None]
-    return "\n".join(["[[morph]]", *lines, ""])
-
-
-def _toml(value: Any) -> str:
-    """A value of TOML."""
-    if isinstance(value, dict):
-        shape = {key: value[key] for key in ("start", "end", "radii", "side")}
-        return f"{{ {', '.join(f'{key} = {_toml(one)}' for key, one in shape.items())} }}"
-    if isinstance(value, str | bool):
-        return json.dumps(value, ensure_ascii=False)
-    return f"[{', '.join(map(_toml, value))}]" if np.ndim(value) else repr(round(float(value), 12))
