@@ -107,6 +107,8 @@ def test_a_take_is_detected_and_tracked_by_a_network_of_its_own(take, tmp_path, 
     assert {k.keypoint_set for k in seen.keypoints} == {"COCO_17"}
     network.with_suffix(".toml").write_text('colours = "RGB"\n')
     assert run(take, *given).stdout.count("(existing results)") == 0, "described otherwise"
+    network.with_name(f"{network.name}.data").write_bytes(b"other weights")
+    assert run(take, *given).stdout.count("(existing results)") == 0, "with other weights beside it"
 
 
 def test_what_is_stale_is_redone_with_the_same_network(take, monkeypatch):

@@ -55,8 +55,8 @@ def check(
     """
     if any(also.values()) and not refine:
         raise click.UsageError("--focal, --distortion, --time-offsets and --points need --refine.")
-    if also["points"] is not None and not also["points"].is_file():
-        raise click.BadParameter(f"no such file: {also['points']}", param_hint="--points")
+    if (points := also["points"]) and not points.is_file():
+        raise click.BadParameter(f"no such file: {points}", param_hint="--points")
     from kinefit._files import write_text
     from kinefit.cli.checks._page import check_page
     from kinefit.cli.checks._refine import refined_of, write_refined

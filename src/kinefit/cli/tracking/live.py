@@ -106,8 +106,7 @@ def live(
     session: LiveSession = live_session(entry, speed=speed, folder=folder, tell=_screen.note)
     try:
         rate, up = session.tracker.rate, entry.up
-        for receiver in send(rate, up):
-            receivers.append(receiver)
+        receivers.extend(send(rate, up))  # one after the other: what is open is closed below
         kept = None if folder is None else MotionRecord(folder, rate=rate, up=up, name=entry.name)
         if kept is not None:
             receivers.append(kept)

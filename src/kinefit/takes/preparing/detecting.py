@@ -433,14 +433,15 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
 
 
 def _name_of(quality: str | Path) -> str:
-    """Name that distinguishes results by quality, or by the network's file and the one that describes it."""
+    """Name that distinguishes results by quality, or by the network's file and those of its weights and description."""
     if isinstance(quality, str):
         return quality
     try:
         with regular(quality).open("rb") as file:
             digest = hashlib.file_digest(file, "sha256")
-        if (stated := description_file(quality)).is_file():
-            digest.update(stated.read_bytes())
+        for beside in Path(f"{quality}.data"), description_file(quality):
+            if beside.is_file():
+                digest.update(beside.read_bytes())
     except OSError as error:
         raise FileError(f"cannot be read ({error.strerror})", file=quality, remedy="Check its path.") from error
     return digest.hexdigest()[:16]
