@@ -85,7 +85,7 @@ def test_toml_can_be_read(page):
 def test_parts_of_benchmarks_are_there():
     pattern = re.compile(r"python -m benchmarks ([a-z]\w*)([^`]*)`")
     shown = [one for page in PAGES for one in pattern.findall(page.read_text("utf-8"))]
-    assert len(shown) > 30
+    assert len(shown) > 45
     for area, parts in shown:
         assert area in AREAS, area
         named = re.findall(r"(?<=\s)[a-z]\w+", parts) if AREAS[area] else []

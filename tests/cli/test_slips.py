@@ -273,6 +273,9 @@ def test_a_take_of_an_editor_of_windows_is_read(take):
     text = take.read_text()
     take.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
     assert read_take(take).rate == 30.0
+    take.write_bytes(text.encode("utf-16"))
+    told = run("check", take)
+    assert told.exit_code == 2 and "UTF-8" in told.stderr
     take.unlink()
     take.with_name("monday.toml").write_bytes(b"\xef\xbb\xbf" + text.encode())
     assert read_take(take.parent).path.name == "monday.toml"

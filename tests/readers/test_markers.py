@@ -144,6 +144,9 @@ def test_c3d_without_a_known_unit(small_c3d, tmp_path):
     (tmp_path / "a.c3d").write_bytes(raw[:at] + b"xq" + raw[at + 2 :])
     with pytest.raises(ObservationError, match="no unit 'xq'; there are: m"):
         read_markers(tmp_path / "a.c3d")
+    (tmp_path / "a.c3d").write_bytes(raw[:at] + b"  " + raw[at + 2 :])
+    with pytest.raises(ObservationError, match="states no unit"):
+        read_markers(tmp_path / "a.c3d")
 
 
 def test_truncated_c3d_tells_what_can_be_read(small_c3d, tmp_path):

@@ -91,7 +91,7 @@ def test_a_sensor_that_does_not_exist_is_refused(motion, tmp_path, sensors):
 def test_depths_as_colours():
     shown = depth_colours(np.array([[0.0, 1.0, 5.0]]), 1.0, 5.0)
     assert shown.shape == (1, 3, 3)
-    assert not shown[0, 0].any()
+    assert not shown[0, 0].any() and not depth_colours(np.array([[np.nan]]), 1.0, 5.0).any()
     assert shown[0, 1, 0] > shown[0, 1, 2]  # near is red
     assert shown[0, 2, 2] > shown[0, 2, 0]
 

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.bodies.motion import UP_AXES, Motion
 from kinefit.errors import ExportError, ObservationError, choices
-from kinefit.exporters.pictures.drawing import depth_colours
 from kinefit.fitting import Recording, Tracker, track
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import DepthFrame, Keypoints
@@ -251,6 +250,8 @@ def preview(scene: SimulatedScene, rig: Rig, *, frame: int | None = None, seed: 
 
     Depth is shown as colours: near red, far blue, black for pixels without depth.
     """
+    from kinefit.exporters.pictures.drawing import depth_colours
+
     frame = len(scene.motion) // 2 if frame is None else frame
     points, images = places(scene.motion).reshape(len(scene.motion), -1, 3)[frame], []
     for camera in rig:

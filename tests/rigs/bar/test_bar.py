@@ -197,6 +197,16 @@ def test_centroids_to_a_tenth_of_a_pixel_without_the_lamps():
     assert len(errors) >= 11 and np.median(errors) < 0.1
 
 
+@pytest.mark.parametrize("shape", [(2, 2), (3, 2), (4, 2), (2, 3)])
+def test_small_targets_are_found_where_they_are(shape):
+    image = np.full((100, 200), 20, np.uint8)
+    image[40 : 40 + shape[0], 60 : 60 + shape[1]] = 230
+    image[70:74, 150:153] = 240
+    centres = np.array([[60 + (shape[1] - 1) / 2, 40 + (shape[0] - 1) / 2], [151.0, 71.5]])
+    uv = targets_in(image)
+    np.testing.assert_allclose(uv[np.argsort(uv[:, 0])], centres, atol=0.05)
+
+
 def test_tables(tmp_path, known):
     file = tmp_path / "centroids.csv"
     rows = [f"{n},{f},{u},{v}" for n, s in known[2].items() for f, uv in s.ends.items() for u, v in uv]

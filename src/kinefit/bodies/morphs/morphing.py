@@ -16,12 +16,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.morphs import operators as kinds
+from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph, radial_basis
 from kinefit.bodies.surfaces import BodyMesh, MeshSurface, SkinnedMesh, triangles
 from kinefit.bodies.surfaces.places import body_mesh
 from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
 from kinefit.bodies.tree import BodyState
 from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3
+
+__all__ = [
+    "GlobalMorph", "JointMotion", "LocalMorph", "MorphedPose", "Morphing", "Operator", "SegmentMorph", "radial_basis",
+]
 
 _AROUND, _ALONG = 20, 6  # nodes of cylinders, see `body_mesh`
 _MIN_BULGE = 1e-8  # of a radial basis function: derivatives of smaller values are ignored

@@ -202,9 +202,10 @@ def draw_dot(image: NDArray, uv: NDArray, radius: float, colour: tuple[int, int,
 
 def depth_colours(depth: NDArray, near: float, far: float) -> NDArray[np.uint8]:
     """Depth (H, W) [m] as colours (H, W, 3) RGB: red at `near` [m], blue at `far`, black for pixels without depth."""
-    share = np.clip((far - depth) / (far - near), 0.0, 1.0)
+    has_depth = depth > 0.0
+    share = np.where(has_depth, np.clip((far - depth) / (far - near), 0.0, 1.0), 0.0)
     out = cv2.applyColorMap((255 * share).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
-    out[depth <= 0.0] = 0
+    out[~has_depth] = 0
     return np.asarray(out, np.uint8)
 
 

@@ -126,7 +126,7 @@ def targets_in(grey: NDArray, still: NDArray | None = None) -> NDArray:
 
 def _centroid(weight: NDArray) -> tuple[NDArray, float]:
     """Centroid (u, v) of weights (H, W), and their aspect ratio (length over width)."""
-    m = cv2.moments(weight)
+    m = cv2.moments(weight.astype(float))  # OpenCV takes (H, 2) in single precision for a contour
     centre = np.array([m["m10"], m["m01"]]) / m["m00"]
     spread = np.array([[m["mu20"], m["mu11"]], [m["mu11"], m["mu02"]]]) / m["m00"]
     small, large = np.linalg.eigvalsh(spread + np.eye(2) / 12.0)  # 1/12: variance of one pixel

@@ -437,11 +437,11 @@ def _name_of(quality: str | Path) -> str:
     if isinstance(quality, str):
         return quality
     try:
-        with regular(quality).open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256")
-        for beside in Path(f"{quality}.data"), description_file(quality):
-            if beside.is_file():
-                digest.update(beside.read_bytes())
+        digest = hashlib.sha256()
+        for part in regular(quality), Path(f"{quality}.data"), Path(f"{quality}_data"), description_file(quality):
+            if part == quality or part.is_file():
+                with part.open("rb") as file:
+                    digest.update(hashlib.file_digest(file, "sha256").digest())
     except OSError as error:
         raise FileError(f"cannot be read ({error.strerror})", file=quality, remedy="Check its path.") from error
     return digest.hexdigest()[:16]
