@@ -52,8 +52,8 @@ def _time(name: str, unit_s: float, unit: str, goal: str, folder: Path, command:
     words = ["bash", "-euo", "pipefail", "-c", command]
     done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, timeout=_LIMIT_S)
     spent = (time.monotonic() - began) / unit_s
-    last = (done.stdout + done.stderr).strip().splitlines()[-1:]
-    print(f"# {command}: exit code {done.returncode}; {' '.join(last)}", flush=True)
+    lines = (done.stdout + done.stderr).strip().splitlines()
+    print(f"# {command}: exit code {done.returncode}", *lines[-20 if done.returncode else -1 :], sep="\n# ", flush=True)
     figure(name, spent if done.returncode == 0 else None, unit, goal, f"it ended with code {done.returncode}")
 
 
