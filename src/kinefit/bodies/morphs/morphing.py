@@ -58,7 +58,7 @@ class Morphing:
         self,
         body: Body,
         mesh: BodyMesh | SkinnedMesh | None = None,
-        operators: Sequence[kinds.Operator] | None = None,
+        operators: Sequence[Operator] | None = None,
         parameters: NDArray | None = None,
     ) -> None:
         self.body = body
@@ -73,22 +73,22 @@ class Morphing:
             if o.steering.coordinate not in tree.coordinates:
                 name = o.steering.coordinate
                 raise BodyError(choices(f"angle of body '{body.name}' named", name, tree.coordinates))
-        motions = [(o, tree.segment(o.segment)) for o in self.operators if isinstance(o, kinds.JointMotion)]
+        motions = [(o, tree.segment(o.segment)) for o in self.operators if isinstance(o, JointMotion)]
         if any(s == 0 for _, s in motions):
             raise BodyError("the root has no joint that could move", remedy="Name a segment that has a joint.")
-        self._motions: dict[int, list[kinds.JointMotion]] = {}
+        self._motions: dict[int, list[JointMotion]] = {}
         for o, s in motions:
             self._motions.setdefault(s, []).append(o)
         self._fields: list[tuple[kinds.Steering, NDArray]] = []
         # Bulges of one function r, at rest, that act together; nodes, their shares, and the segment that carries them.
-        self._bulges: list[tuple[list[kinds.LocalMorph], NDArray, NDArray, int | None]] = []
-        together: dict[object, list[kinds.LocalMorph]] = {}
+        self._bulges: list[tuple[list[LocalMorph], NDArray, NDArray, int | None]] = []
+        together: dict[object, list[LocalMorph]] = {}
         for o in self.operators:
-            if isinstance(o, kinds.GlobalMorph):
+            if isinstance(o, GlobalMorph):
                 self._fields.append((o.steering, o.field(x, parameters)))
-            elif isinstance(o, kinds.SegmentMorph):
+            elif isinstance(o, SegmentMorph):
                 self._fields.append((o.steering, self._segment_field(o)))
-            elif isinstance(o, kinds.LocalMorph) and (o.moves or o.deforms):
+            elif isinstance(o, LocalMorph) and (o.moves or o.deforms):
                 carrier, share = tree.segment(str(o.segment)) if o.moves else None, self._node_shares(o)[:, 0]
                 one = (carrier, o.on, *(np.asarray(v, float).tobytes() for v in (o.centre, o.radii, o.tilt)))
                 bulges = together.setdefault(id(o) if o.deforms else one, [])
@@ -96,7 +96,7 @@ class Morphing:
                 if len(bulges) == 1:
                     nodes = np.flatnonzero(share)
                     self._bulges.append((bulges, nodes, share[nodes], carrier))
-            elif isinstance(o, kinds.LocalMorph):
+            elif isinstance(o, LocalMorph):
                 self._fields.append((o.steering, self._node_shares(o) * o.placed(tree).field(x, parameters)))
         above = np.eye(len(tree.segments), dtype=bool)
         for s in range(1, len(tree.segments)):
@@ -137,14 +137,14 @@ class Morphing:
             out.append(smooth)
         return [*out, self]
 
-    def _node_shares(self, morph: kinds.LocalMorph) -> NDArray:
+    def _node_shares(self, morph: LocalMorph) -> NDArray:
         """Share (V, 1) of each node that belongs to segments of a local morph."""
         if not morph.on:
             return np.ones((len(self.skin.nodes), 1))
         chosen = np.isin(self.skin.owners, [self.body.tree.segment(name) for name in morph.on])
         return np.sum(self.skin.weights * chosen, 1, keepdims=True)
 
-    def _segment_field(self, morph: kinds.SegmentMorph) -> NDArray:
+    def _segment_field(self, morph: SegmentMorph) -> NDArray:
         """Shifts (V, 3) [m] from a segment's surfaces to their second shape, for the mesh of the body's surfaces."""
         here, body = self.body.tree.segment(morph.segment), self.body
         place, remedy = f"morph of {morph.segment}", "Give one for each of the segment's surfaces, of the same kind."
@@ -214,7 +214,7 @@ class Morphing:
         return MorphedPose(self, state, frames, screws, shift, tuple(drives))
 
     def _carried(
-        self, bulges: Sequence[kinds.LocalMorph], nodes: NDArray, bone: int | None, frames: NDArray
+        self, bulges: Sequence[LocalMorph], nodes: NDArray, bone: int | None, frames: NDArray
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Bulges that move with a bone, r(y) of nodes y in the bone's frame in this pose, or that deform.
 

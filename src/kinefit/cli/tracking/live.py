@@ -36,15 +36,11 @@ def _page(page: bool, port: int, host: str, token: str | None) -> Callable[..., 
     return partial(WebSockets, port, host=host, token=token) if page else None
 
 
-def _receivers(
-    lines: str | None, vmc: tuple[str, int] | None, lsl: str | None
-) -> Callable[[float, str], Iterator[Receiver]]:
+def _receivers(vmc: tuple[str, int] | None, lsl: str | None) -> Callable[[float, str], Iterator[Receiver]]:
     """What opens the receivers that are asked for, one after the other, given the rate [Hz] and the vertical axis."""
     from kinefit.studio.live.receivers import websocket
 
     def opened(rate: float, up: str) -> Iterator[Receiver]:
-        if lines is not None:
-            yield websocket.JsonLines(lines)
         if vmc is not None:
             yield websocket.Vmc(*vmc, up=up)
         if lsl is not None:
@@ -79,10 +75,11 @@ Examples:
 )
 @_screen.verbose_option
 @_screen.gathered("serve", _page, "page", "port", "host", "token")
-@_screen.gathered("send", _receivers, "lines", "vmc", "lsl")
+@_screen.gathered("send", _receivers, "vmc", "lsl")
 def live(
     take: Path, out: Path | None, serve: Callable[..., WebSockets] | None,
-    send: Callable[[float, str], Iterator[Receiver]], speed: float, seconds: float | None, record: bool,
+    lines: str | None, send: Callable[[float, str], Iterator[Receiver]], speed: float, seconds: float | None,
+    record: bool,
 ) -> None:
     """Track a person live, and stream the poses.
 
@@ -96,16 +93,18 @@ def live(
     """
     from kinefit.readers.take.file import read_take
     from kinefit.simulation.recordings import warm_depth, warm_keypoints
+    from kinefit.studio.live.receivers.websocket import JsonLines
     from kinefit.studio.live.record import MotionRecord
     from kinefit.studio.live.take import folder_of, live_session
 
     entry = read_take(take)
-    quiet = click.get_current_context().params["lines"] == "-"
+    quiet = lines == "-"
     receivers: list[Receiver] = []
     folder = (out or folder_of(entry)) if record else None
     session: LiveSession = live_session(entry, speed=speed, folder=folder, tell=_screen.note)
     try:
         rate, up = session.tracker.rate, entry.up
+        receivers += [] if lines is None else [JsonLines(lines)]
         receivers.extend(send(rate, up))  # one after the other: what is open is closed below
         kept = None if folder is None else MotionRecord(folder, rate=rate, up=up, name=entry.name)
         if kept is not None:
